@@ -14,13 +14,7 @@ from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.records import CameraIntrinsics
-from realsim.rendering.casting.pixel_caster import (
-    PixelCaster,
-    canvas_rays,
-    empty_buffers,
-    enter,
-    finished,
-)
+from realsim.rendering.casting import pixel_caster
 from realsim.rendering.casting.surface_maps import surface_maps
 from realsim.rendering.rays import BACKGROUND, HitBuffer, PlacedMesh, RayScene
 
@@ -127,7 +121,7 @@ class LabelRenderer:
         instances = [p.instance for p in self.placed if p.instance != BACKGROUND]
         if len(set(instances)) != len(instances):
             raise InputError(f"two placed meshes share an instance number: {sorted(instances)}.")
-        self._caster = PixelCaster(self.placed)
+        self._caster = pixel_caster.PixelCaster(self.placed)
         # The last entry answers geometry -1 (nothing).
         self._instances = np.array([*(p.instance for p in self.placed), BACKGROUND], np.int32)
         counts = [len(p.mesh.faces) for p in self.placed]
@@ -152,9 +146,9 @@ class LabelRenderer:
         """
         T = se3.check_rigid(T_world_cam, "T_world_cam")
         rays = camera.ray_table(intrinsics)
-        canvas = canvas_rays(intrinsics)
+        canvas = pixel_caster.canvas_rays(intrinsics)
         shape = rays.shape[:2]
-        buffers = empty_buffers(rays)
+        buffers = pixel_caster.empty_buffers(rays)
         amodal: dict[int, Mask] = {}
         windows: dict[int, tuple[slice, slice]] = {}
         count_all: dict[int, int] = {}
@@ -162,14 +156,14 @@ class LabelRenderer:
         for number, p in enumerate(self.placed):
             mesh = self._caster.project(number, intrinsics, T)
             covered = np.zeros(shape if p.instance != BACKGROUND else (0, 0), np.bool_)
-            entered = enter(mesh, number, rays, buffers, covered)
+            entered = pixel_caster.enter(mesh, number, rays, buffers, covered)
             if p.instance == BACKGROUND:
                 continue
             amodal[p.instance], windows[p.instance] = covered, entered.window
             count_all[p.instance] = entered.count + canvas.count_beyond(mesh, entered.bounds)
             if mesh.contains_camera:
                 inside.append(p.instance)
-        hits = finished(buffers)
+        hits = pixel_caster.finished(buffers)
         seen = np.bincount(hits.geometry.ravel() + 1, minlength=len(self.placed) + 1)[1:]
         T_cam_world = se3.invert(T)
         return Labels(

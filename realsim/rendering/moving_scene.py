@@ -28,25 +28,7 @@ from realsim.rendering.casting.pixel_caster import (
     may_be_seen,
     projected,
 )
-from realsim.rendering.embedded.room_light import (
-    RoomSamples,
-    RoomView,
-    busy_among,
-    empty_samples,
-    encoded,
-    lit_colors,
-    mean_colors,
-    room_surfaces,
-    room_view,
-    sample_room,
-    tones,
-)
-from realsim.rendering.embedded.sun_shadows import (
-    SortedPoints,
-    SunBodies,
-    cast_shadows,
-    sort_points,
-)
+from realsim.rendering.embedded import room_light, sun_shadows
 from realsim.rendering.photo import Lighting
 from realsim.rendering.rays import PlacedMesh
 
@@ -67,7 +49,7 @@ class Moment:
 
     Ts_world_obj: Array
     """(G, 4, 4) [m]."""
-    in_the_sun: SunBodies
+    in_the_sun: sun_shadows.SunBodies
     """The meshes in the sun's frame."""
 
 
@@ -81,7 +63,7 @@ class Seen:
     """The meshes."""
     hits: tuple[Buffers, Buffers]
     """What the centres of the pixels see, and what their parts see."""
-    points: SortedPoints
+    points: sun_shadows.SortedPoints
     """Where the sun could shine on what the centres see."""
     lit: Mask
     """(P,) where it does."""
@@ -108,7 +90,7 @@ class MovingScene:
         self.lighting = light = lighting or Lighting()
         self._every = tuple(range(len(placed)))
         self._caster = PixelCaster(placed)
-        self._surfaces = room_surfaces(placed, light.gamma)
+        self._surfaces = room_light.room_surfaces(placed, light.gamma)
         self._R_sun_world = light.R_sun_world()
         self._light = light.rows()
         bodies, Ts = self._caster.bodies, [p.T_world_obj for p in placed]
@@ -116,7 +98,7 @@ class MovingScene:
         self._kept: dict[tuple[int, ...], tuple[Buffers, Mask]] = {}
         firsts = [0, *accumulate(len(b.vertices) for b in bodies)]
         self._rows = [slice(*ends) for ends in pairwise(firsts)]
-        in_the_sun = SunBodies(
+        in_the_sun = sun_shadows.SunBodies(
             np.concatenate([self._in_the_sun(k, T) for k, T in enumerate(Ts)]),
             np.concatenate([b.faces + np.int32(k) for b, k in zip(bodies, firsts, strict=False)]),
             self._surfaces.first_face,
@@ -180,9 +162,9 @@ class MovingScene:
         color[darker] = still.ambient[darker]
         view, rows = self._view(moment, T), np.flatnonzero(moved)
         samples, _, sunlit = self._sampled(moment, view, intrinsics, centres, rows, self._every)
-        color[rows] = lit_colors(samples, sunlit)
+        color[rows] = room_light.lit_colors(samples, sunlit)
         changed = moved | darker
-        tones(color, self.lighting.gamma, np.flatnonzero(changed), tone)
+        room_light.tones(color, self.lighting.gamma, np.flatnonzero(changed), tone)
         near = changed.reshape(geometry.shape).astype(np.uint8)
         rows = np.flatnonzero(cv2.dilate(near, np.ones((3, 3), np.uint8)))
         whole[rows] = color[rows]
@@ -215,16 +197,18 @@ class MovingScene:
         self._enter(numbers, moment, (i, T), centres)
         view, rows = self._view(moment, T), np.arange(i.height * i.width)
         samples, points, lit = self._sampled(moment, view, i, centres, rows, numbers)
-        color, tone = lit_colors(samples, lit), np.empty(len(rows), np.float32)
-        tones(color, self.lighting.gamma, rows, tone)
+        color, tone = room_light.lit_colors(samples, lit), np.empty(len(rows), np.float32)
+        room_light.tones(color, self.lighting.gamma, rows, tone)
         whole = color.copy()
         self._refine(moment, view, seen_by, (centres[1], tone, rows, whole), None, numbers)
         hits = centres, centres
         return Seen(seen_by, numbers, hits, points, lit, samples.ambient, color, tone, whole)
 
-    def _view(self, moment: Moment, T_world_cam: Array) -> RoomView:
+    def _view(self, moment: Moment, T_world_cam: Array) -> room_light.RoomView:
         """Return a camera as the kernels take it."""
-        return room_view(self._light, self._R_sun_world, moment.Ts_world_obj, T_world_cam)
+        return room_light.room_view(
+            self._light, self._R_sun_world, moment.Ts_world_obj, T_world_cam
+        )
 
     def _enter(
         self, numbers: Sequence[int], moment: Moment, seen_by: tuple[CameraIntrinsics, Array],
@@ -241,27 +225,27 @@ class MovingScene:
                 enter(mesh, k, rays, buffers, NOT_WANTED, among)
 
     def _cast_shadows(
-        self, numbers: Sequence[int], moment: Moment, points: SortedPoints, lit: Mask
+        self, numbers: Sequence[int], moment: Moment, points: sun_shadows.SortedPoints, lit: Mask
     ) -> None:
         """Clear `lit` where one of these meshes keeps the sun off."""
-        cast_shadows(points, moment.in_the_sun, np.array(numbers, np.int64), lit)
+        sun_shadows.cast_shadows(points, moment.in_the_sun, np.array(numbers, np.int64), lit)
 
     def _sampled(
-        self, moment: Moment, view: RoomView, intrinsics: CameraIntrinsics, hits: Buffers,
-        rows: Int64, numbers: Sequence[int],
-    ) -> tuple[RoomSamples, SortedPoints, Mask]:  # fmt: skip
+        self, moment: Moment, view: room_light.RoomView, intrinsics: CameraIntrinsics,
+        hits: Buffers, rows: Int64, numbers: Sequence[int],
+    ) -> tuple[room_light.RoomSamples, sun_shadows.SortedPoints, Mask]:  # fmt: skip
         """Return what rays of a camera see, where the sun could shine there, and where it does."""
-        out: RoomSamples = empty_samples(len(rows))
+        out: room_light.RoomSamples = room_light.empty_samples(len(rows))
         rays = camera.ray_table(intrinsics).reshape(-1, 3)
         pixel_rad = 1.0 / float(np.sqrt(intrinsics.fx * intrinsics.fy))
         seen = hits[1].reshape(-1), hits[2].reshape(-1)
-        sample_room(self._surfaces, view, rays, seen, rows, pixel_rad, out)
-        points, lit = sort_points(out.toward_sun), np.ones(len(rows), np.bool_)
+        room_light.sample_room(self._surfaces, view, rays, seen, rows, pixel_rad, out)
+        points, lit = sun_shadows.sort_points(out.toward_sun), np.ones(len(rows), np.bool_)
         self._cast_shadows(numbers, moment, points, lit)
         return out, points, lit
 
     def _refine(
-        self, moment: Moment, view: RoomView,
+        self, moment: Moment, view: room_light.RoomView,
         seen_by: tuple[CameraIntrinsics, CameraIntrinsics, Array],
         pixels: tuple[Int32, Array32, Int64, Array32], below: Buffers | None,
         numbers: Sequence[int],
@@ -281,7 +265,7 @@ class MovingScene:
         n, (intrinsics, finer, T) = self.lighting.samples, seen_by
         if n == 1:
             return
-        rows = rows[busy_among(tone, geometry, self.lighting.contrast).ravel()[rows]]
+        rows = rows[room_light.busy_among(tone, geometry, self.lighting.contrast).ravel()[rows]]
         first = (rows // intrinsics.width) * n * finer.width + (rows % intrinsics.width) * n
         of_pixel = (np.arange(n)[:, None] * finer.width + np.arange(n)).ravel()
         parts = (first[:, None] + of_pixel).ravel()
@@ -297,7 +281,7 @@ class MovingScene:
         among.reshape(-1)[parts] = False
         every = numbers if below is None else self._every
         samples, _, lit = self._sampled(moment, view, finer, hits, parts, every)
-        mean_colors(samples, lit, n * n, rows, whole)
+        room_light.mean_colors(samples, lit, n * n, rows, whole)
 
     def _finished(self, centres: Buffers, whole: Array32) -> MovingPicture:
         """Return the picture behind the lens, and its depth."""
@@ -307,5 +291,5 @@ class MovingScene:
         color = whole.reshape(*depth.shape, 3)
         if self.lighting.psf_px > 0:
             color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
-        rgb = encoded(color.reshape(-1, 3), self.lighting.gamma).reshape(color.shape)
+        rgb = room_light.encoded(color.reshape(-1, 3), self.lighting.gamma).reshape(color.shape)
         return MovingPicture(rgb, np.where(geometry < 0, np.float32(0.0), depth))

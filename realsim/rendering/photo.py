@@ -25,20 +25,10 @@ from realsim.geometry.colors import srgb_encoded
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
 from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
+from realsim.rendering.embedded import room_light
 from realsim.rendering.embedded.edge_samples import world_rays
 from realsim.rendering.embedded.environment_view import EnvironmentRenderer, LightSampling
 from realsim.rendering.embedded.materials import check_projection
-from realsim.rendering.embedded.room_light import (
-    RoomView,
-    busy_among,
-    empty_samples,
-    lit_colors,
-    room_surfaces,
-    room_view,
-    sample_room,
-    sun_rays,
-    tones,
-)
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 
 SHOULDER = 0.8
@@ -218,7 +208,7 @@ class PhotoRenderer:
             return
         self._scene = RayScene(self.placed)
         self._caster = PixelCaster(self.placed)
-        self._surfaces = room_surfaces(self.placed, self.lighting.gamma)
+        self._surfaces = room_light.room_surfaces(self.placed, self.lighting.gamma)
 
     def render(
         self,
@@ -268,13 +258,13 @@ class PhotoRenderer:
         # Far from the world's origin float32 would lose digits.
         to_center = se3.from_translation(-self._scene.center)
         Ts_center_obj = to_center @ np.array([p.T_world_obj for p in self.placed]).reshape(-1, 4, 4)
-        view = room_view(light.rows(), light.R_sun_world(), Ts_center_obj, to_center @ T)
+        view = room_light.room_view(light.rows(), light.R_sun_world(), Ts_center_obj, to_center @ T)
         pixel_rad = 1.0 / float(np.sqrt(i.fx * i.fy))
         color = self._lit(view, table.reshape(-1, 3), (geometry, hits.face.ravel()), pixel_rad)
         if n > 1:
             tone = np.empty(len(every), np.float32)
-            tones(color, light.gamma, every, tone)
-            busy = busy_among(tone, hits.geometry, light.contrast)
+            room_light.tones(color, light.gamma, every, tone)
+            busy = room_light.busy_among(tone, hits.geometry, light.contrast)
             rows = np.flatnonzero(busy & np.isfinite(table[..., 0]))
             offsets = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
             offsets = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
@@ -286,15 +276,15 @@ class PhotoRenderer:
         return color.reshape(*table.shape[:2], 3), hits
 
     def _lit(
-        self, view: RoomView, rays: Array32, hits: tuple[Int32, Int32], pixel_rad: float
+        self, view: room_light.RoomView, rays: Array32, hits: tuple[Int32, Int32], pixel_rad: float
     ) -> Array32:
         """Return the light (N, 3) that rays see: with one shadow ray each; see `sample_room`."""
-        out, every = empty_samples(len(rays)), np.arange(len(rays))
-        sample_room(self._surfaces, view, rays, hits, every, pixel_rad, out)
+        out, every = room_light.empty_samples(len(rays)), np.arange(len(rays))
+        room_light.sample_room(self._surfaces, view, rays, hits, every, pixel_rad, out)
         lit = np.zeros(len(rays), np.bool_)
-        to_sun, facing = sun_rays(out.toward_sun, view.R_sun_world.astype(np.float32))
+        to_sun, facing = room_light.sun_rays(out.toward_sun, view.R_sun_world.astype(np.float32))
         lit[facing] = ~self._scene.shadowed(to_sun)
-        return lit_colors(out, lit)
+        return room_light.lit_colors(out, lit)
 
     def _expose(self, color: Array32, rng: np.random.Generator | None) -> UInt8:
         """Return the encoded picture: shot and read noise, saturation, gamma."""

@@ -15,16 +15,9 @@ import numpy as np
 
 from realsim.arrays import Array, UInt8
 from realsim.records import View
+from realsim_capture_plans.capturing import look
 from realsim_capture_plans.capturing.checks import Check
 from realsim_capture_plans.capturing.log import CaptureLog, replace_view
-from realsim_capture_plans.capturing.look import (
-    BoardCheck,
-    CaptureConfig,
-    Looker,
-    NoGoodFrameError,
-    Shot,
-    run_of_notes,
-)
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, ArmStoppedError, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -119,7 +112,7 @@ class CaptureJob:
 
     operator: Operator = field(default_factory=NoOperator)
     """Who is told and asked; by default nobody."""
-    board_check: BoardCheck | None = None
+    board_check: look.BoardCheck | None = None
     """Says what is wrong with an image of the calibration target."""
     views: tuple[int, ...] | None = None
     """Take only these; by default all."""
@@ -146,8 +139,8 @@ class Run:
         plan: CapturePlan,
         arm: Arm,
         camera: DepthCamera | None,
-        config: CaptureConfig,
-        looker: Looker,
+        config: look.CaptureConfig,
+        looker: look.Looker,
         log: CaptureLog,
         job: CaptureJob,
         store: "SessionStore | None",
@@ -269,7 +262,7 @@ class Run:
             self._arm.move(joints, scale * plan.speed, scale * plan.acceleration)
         self._place = k
 
-    def _keep(self, k: int, shot: Shot, rejected: Sequence[tuple[int, str]]) -> None:
+    def _keep(self, k: int, shot: look.Shot, rejected: Sequence[tuple[int, str]]) -> None:
         """Put a frame on the disk and say so."""
         self._tell_warnings()
         aside = ""
@@ -329,7 +322,7 @@ class Run:
             return
         self._noted[k] = "; ".join(notes)
         self._operator.tell(f"view {k} stored with a note: {self._noted[k]}", trouble=True)
-        again = run_of_notes(self._recent, self._config.ask_after)
+        again = look.run_of_notes(self._recent, self._config.ask_after)
         if again:
             self._recent.clear()
             self._obey(
@@ -419,7 +412,7 @@ class Run:
 
     def _recover(self, error: DeviceError) -> None:
         """Make the device that stopped ready again."""
-        if isinstance(error, NoGoodFrameError | NoWayError):
+        if isinstance(error, look.NoGoodFrameError | NoWayError):
             return  # no device has stopped: a person has changed something
         if isinstance(error, ArmStoppedError) or self._camera is None:
             self._arm.recover()

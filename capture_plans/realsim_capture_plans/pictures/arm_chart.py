@@ -8,23 +8,14 @@ from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.robots.shapes import Box
+from realsim_capture_plans.pictures import drawing
 from realsim_capture_plans.pictures.arm_looks import arm_parts, part_frames
-from realsim_capture_plans.pictures.drawing import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    PlanCurves,
-    new_figure,
-    plain,
-)
 from realsim_capture_plans.planning.view_quality import scene_box
 from realsim_capture_plans.planning.viewpoints import farthest_points
 
 ARMS_SHOWN = 3
 """Arms drawn, those whose cameras are farthest apart; more hide each other."""
-ARM_COLORS = (BLUE, GREEN, PURPLE)
+ARM_COLORS = (drawing.BLUE, drawing.GREEN, drawing.PURPLE)
 LIGHT = np.array([0.3, -0.5, 0.81])
 """Where the drawn bodies are lit from, in base; about a unit vector."""
 LONGEST_EDGE_M = 0.10
@@ -37,9 +28,9 @@ DRAWN_REACH_M = 1.0
 """The table is drawn no farther than this from the base [m]."""
 
 
-def arm_chart(curves: PlanCurves) -> Any:
+def arm_chart(curves: drawing.PlanCurves) -> Any:
     """Return the figure: the arm, cameras, table and keep-out box, three ways."""
-    figure = new_figure(13.0, 7.6)
+    figure = drawing.new_figure(13.0, 7.6)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.55, 1])
     draw_arm(figure.add_subplot(grid[:, 0], projection="3d"), curves)
     _draw_flat(figure.add_subplot(grid[0, 1]), curves, (0, 1), "from above")
@@ -54,7 +45,7 @@ def arm_chart(curves: PlanCurves) -> Any:
     return figure
 
 
-def draw_arm(axes: Any, curves: PlanCurves) -> None:
+def draw_arm(axes: Any, curves: drawing.PlanCurves) -> None:
     """Draw the scene in space on a 3-D axes."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
     from trimesh.remesh import subdivide_to_size
@@ -62,7 +53,10 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
     plan, camera = curves.plan, curves.sensor.intrinsics
     # The order is given: matplotlib would guess it, and draw the table over the arm.
     axes.computed_zorder = False
-    for box, color in [(scene_box(plan), ORANGE), *((b, RED) for _, b in plan.cell.obstacles)]:
+    for box, color in [
+        (scene_box(plan), drawing.ORANGE),
+        *((b, drawing.RED) for _, b in plan.cell.obstacles),
+    ]:
         lines = Line3DCollection(box_edges(box), colors=color, linewidths=1.6, zorder=2)
         axes.add_collection3d(lines)
     small = frustum_lines(plan.Ts_base_cam, camera, SMALL_FRUSTUM_M)
@@ -98,7 +92,7 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _draw_flat(axes: Any, curves: PlanCurves, plane: tuple[int, int], title: str) -> None:
+def _draw_flat(axes: Any, curves: drawing.PlanCurves, plane: tuple[int, int], title: str) -> None:
     """Draw the scene projected on two of base's axes."""
     from matplotlib.collections import LineCollection, PolyCollection
     from scipy.spatial import ConvexHull
@@ -121,25 +115,25 @@ def _draw_flat(axes: Any, curves: PlanCurves, plane: tuple[int, int], title: str
 
     small = frustum_lines(plan.Ts_base_cam, curves.sensor.intrinsics, SMALL_FRUSTUM_M)
     draw(small, "0.3", 0.4, "every view's camera")
-    draw(box_edges(scene_box(plan)), ORANGE, 1.8, "keep-out box")
+    draw(box_edges(scene_box(plan)), drawing.ORANGE, 1.8, "keep-out box")
     for k, (_, obstacle) in enumerate(plan.cell.obstacles):
-        draw(box_edges(obstacle), RED, 1.5, "obstacle" if k == 0 else None)
+        draw(box_edges(obstacle), drawing.RED, 1.5, "obstacle" if k == 0 else None)
     axes.autoscale_view()
     axes.set_aspect("equal")
     axes.set_xlabel(f"{'xyz'[a]} [m]")
     axes.set_ylabel(f"{'xyz'[b]} [m]")
     axes.set_title(title, fontsize=10)
-    plain(axes)
+    drawing.plain(axes)
 
 
-def _shown(curves: PlanCurves) -> list[int]:
+def _shown(curves: drawing.PlanCurves) -> list[int]:
     """Return the views that arms are drawn at: the topmost and those farthest from it."""
     n = min(ARMS_SHOWN, len(curves.plan))
     places = curves.plan.Ts_base_cam[:, :3, 3]
     return sorted(int(k) for k in farthest_points(places, n, curves.plan.reference_view))
 
 
-def _posed(curves: PlanCurves, view: int) -> list[tuple[Array, Int64]]:
+def _posed(curves: drawing.PlanCurves, view: int) -> list[tuple[Array, Int64]]:
     """Return vertices (V, 3) in base [m] and triangles of every body of the arm at a view."""
     frames = part_frames(curves.plan, curves.plan.joints[view])
     return [(se3.transform(frames[p.frame], p.vertices), p.faces) for p in arm_parts(curves.plan)]

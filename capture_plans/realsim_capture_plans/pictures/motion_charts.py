@@ -5,16 +5,7 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim_capture_plans.pictures.drawing import (
-    BLACK,
-    GREY,
-    GROUP_COLORS,
-    JOINT_COLORS,
-    RED,
-    PlanCurves,
-    new_figure,
-    plain,
-)
+from realsim_capture_plans.pictures import drawing
 from realsim_capture_plans.planning.metrics import joint_names
 from realsim_capture_plans.planning.record import CapturePlan
 
@@ -41,11 +32,11 @@ ZOOM_BEFORE_S, ZOOM_AFTER_S = 3.0, 5.0
 """Shown before and after the slowest move [s]."""
 
 
-def joints_chart(curves: PlanCurves) -> Any:
+def joints_chart(curves: drawing.PlanCurves) -> Any:
     """Return the figure: every joint between its limits over the tour, and the speeds."""
     tour, plan = curves.tour, curves.plan
     n, labels = plan.chain.joints, _labels(plan)
-    figure = new_figure(11.0, 2.5 + 1.4 * n)
+    figure = drawing.new_figure(11.0, 2.5 + 1.4 * n)
     grid = figure.add_gridspec(n + 1, 2, height_ratios=[1] * n + [1.7])
     t = np.linspace(0.0, tour.total_s, FINE_TIMES)
     q = np.degrees(tour.joints_at(t))
@@ -57,11 +48,13 @@ def joints_chart(curves: PlanCurves) -> Any:
         shared = shared or axes
         axes.plot(t, q[:, j], color=_color(j), linewidth=1.1)
         for limit in (lower[j], upper[j]):
-            axes.axhline(limit, color=RED, linewidth=1.2, linestyle="--")
-        axes.axhline(np.degrees(plan.home[j]), color=GREY, linewidth=0.8, linestyle=":")
+            axes.axhline(limit, color=drawing.RED, linewidth=1.2, linestyle="--")
+        axes.axhline(np.degrees(plan.home[j]), color=drawing.GREY, linewidth=0.8, linestyle=":")
         for k in via_moves:
             own = np.flatnonzero(tour.move == k)
-            axes.axvspan(tour.begin_s[own[0]], tour.end_s[own[-1]], color=RED, alpha=0.18, lw=0)
+            axes.axvspan(
+                tour.begin_s[own[0]], tour.end_s[own[-1]], color=drawing.RED, alpha=0.18, lw=0
+            )
         span = upper[j] - lower[j]
         axes.set_ylim(lower[j] - 0.06 * span, upper[j] + 0.06 * span)
         axes.set_yticks([round(lower[j]), 0, round(upper[j])])
@@ -70,7 +63,7 @@ def joints_chart(curves: PlanCurves) -> Any:
         axes.text(1.005, 0.5, f"margin\n{margin:.0f}°", transform=axes.transAxes, fontsize=9,
                   va="center", color=_color(j))  # fmt: skip
         axes.tick_params(labelbottom=j == n - 1)
-        plain(axes)
+        drawing.plain(axes)
     shared.set_xlim(0.0, tour.total_s)
     named = ", ".join(str(k) for k in via_moves[:VIAS_NAMED]) or "none"
     if len(via_moves) > VIAS_NAMED:
@@ -93,21 +86,21 @@ def _labels(plan: CapturePlan) -> list[str]:
 
 
 def _color(joint: int) -> str:
-    return JOINT_COLORS[joint % len(JOINT_COLORS)]
+    return drawing.JOINT_COLORS[joint % len(drawing.JOINT_COLORS)]
 
 
-def _draw_speeds(axes: Any, curves: PlanCurves) -> None:
+def _draw_speeds(axes: Any, curves: drawing.PlanCurves) -> None:
     """Draw how long each move takes, in tour order."""
     tour = curves.tour
     seconds = np.bincount(tour.move, weights=tour.end_s - tour.begin_s)
-    axes.bar(np.arange(len(seconds)), seconds, width=1.0, color=JOINT_COLORS[0])
+    axes.bar(np.arange(len(seconds)), seconds, width=1.0, color=drawing.JOINT_COLORS[0])
     axes.set_xlabel("move to view number")
     axes.set_ylabel("seconds")
     axes.set_title(f"time of each move, {seconds.sum():.0f} s in all", fontsize=10)
-    plain(axes)
+    drawing.plain(axes)
 
 
-def _draw_slowest(axes: Any, curves: PlanCurves) -> None:
+def _draw_slowest(axes: Any, curves: drawing.PlanCurves) -> None:
     """Draw the joints' speeds about the slowest move: trapezoids, stop to stop."""
     tour, config = curves.tour, curves.plan.config
     seconds = np.bincount(tour.move, weights=tour.end_s - tour.begin_s)
@@ -119,20 +112,20 @@ def _draw_slowest(axes: Any, curves: PlanCurves) -> None:
     for j, label in enumerate(_labels(curves.plan)):
         axes.plot(t, speed[:, j], color=_color(j), linewidth=1.2, label=label)
     for sign in (-1, 1):
-        axes.axhline(sign * config.speed, color=RED, linewidth=1.0, linestyle="--")
+        axes.axhline(sign * config.speed, color=drawing.RED, linewidth=1.0, linestyle="--")
     axes.set_xlim(t[0], t[-1])
     axes.set_xlabel("time of the tour [s]")
     axes.set_ylabel("speed [rad/s]")
     axes.set_title(f"about the slowest move, to view {slowest}", fontsize=10)
     axes.legend(fontsize=7, ncols=3, loc="lower center", framealpha=0.9)
     axes.set_ylim(-1.75 * config.speed, 1.15 * config.speed)
-    plain(axes)
+    drawing.plain(axes)
 
 
-def clearance_chart(curves: PlanCurves) -> Any:
+def clearance_chart(curves: drawing.PlanCurves) -> Any:
     """Return the figure: the least distance per group along the tour."""
     groups = list(curves.clearance)
-    figure = new_figure(11.0, 1.6 + 2.2 * len(groups))
+    figure = drawing.new_figure(11.0, 1.6 + 2.2 * len(groups))
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
     for group, one in zip(groups, axes, strict=True):
         draw_clearance(one, curves, group)
@@ -153,17 +146,17 @@ def clearance_chart(curves: PlanCurves) -> Any:
     return figure
 
 
-def draw_clearance(axes: Any, curves: PlanCurves, group: str) -> None:
+def draw_clearance(axes: Any, curves: drawing.PlanCurves, group: str) -> None:
     """Draw one group's clearance over time, with its worst spots named."""
     t, distance = curves.samples.time_s, 1000 * curves.clearance[group]
     need = 1000 * curves.plan.config.clearance_m
-    color = GROUP_COLORS.get(group, GREY)
+    color = drawing.GROUP_COLORS.get(group, drawing.GREY)
     axes.plot(t, distance, color=color, linewidth=0.9)
     bad = distance < need
     if np.any(bad):
-        axes.scatter(t[bad], distance[bad], s=9, color=RED, zorder=4)
-    axes.axhline(need, color=RED, linewidth=1.4, linestyle="--")
-    axes.axhspan(min(distance.min(), 0.0) - 20, need, color=RED, alpha=0.10, lw=0)
+        axes.scatter(t[bad], distance[bad], s=9, color=drawing.RED, zorder=4)
+    axes.axhline(need, color=drawing.RED, linewidth=1.4, linestyle="--")
+    axes.axhspan(min(distance.min(), 0.0) - 20, need, color=drawing.RED, alpha=0.10, lw=0)
     bottom = min(distance.min() - 5.0, -2.0)
     axes.set_ylim(bottom, CLEARANCE_TOP_MM)
     axes.set_xlim(0.0, curves.tour.total_s)
@@ -172,7 +165,7 @@ def draw_clearance(axes: Any, curves: PlanCurves, group: str) -> None:
             continue
         move, right = int(curves.samples.move[i]), t[i] > 0.8 * curves.tour.total_s
         shift = (-LABEL_SHIFT if right else LABEL_SHIFT) * curves.tour.total_s
-        axes.scatter(t[i], distance[i], s=45, color=BLACK, zorder=5)
+        axes.scatter(t[i], distance[i], s=45, color=drawing.BLACK, zorder=5)
         axes.annotate(
             f"{distance[i]:.1f} mm on the move to view {move}",
             (t[i], distance[i]), xytext=(t[i] + shift, LABEL_HEIGHTS[rank]),
@@ -185,7 +178,7 @@ def draw_clearance(axes: Any, curves: PlanCurves, group: str) -> None:
         axes.text(0.5, 0.5, f"never nearer than {distance.min():.0f} mm", ha="center",
                   transform=axes.transAxes, fontsize=11, color=color)  # fmt: skip
     axes.set_ylabel(f"{name}\n[mm]", fontsize=10)
-    plain(axes)
+    drawing.plain(axes)
 
 
 def _worst(time_s: Array, distance: Array, total_s: float) -> list[int]:

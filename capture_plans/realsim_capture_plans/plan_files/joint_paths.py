@@ -20,19 +20,14 @@ from realsim.robots.arm import known_chains
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
 from realsim.untrusted.json_text import read_json
-from realsim_capture_plans.plan_files.evidence import (
-    JointUnit,
-    Reading,
-    check_joint_unit,
-    proven_reading,
-)
+from realsim_capture_plans.plan_files import evidence
 from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES
 
 YES = ("1", "true", "yes")
 NO = ("0", "false", "no", "")
 CAMERA_COLUMNS = ("cam_x_m", "cam_y_m", "cam_z_m", "cam_qw", "cam_qx", "cam_qy", "cam_qz")
 """Expected camera pose in base: position [m] and quaternion, w first."""
-UNIT_NAMES: dict[str, JointUnit] = {
+UNIT_NAMES: dict[str, evidence.JointUnit] = {
     "rad": "rad",
     "radian": "rad",
     "radians": "rad",
@@ -53,14 +48,14 @@ class JointPath:
     """(N,) rows that are only passed; the others are views."""
     rows: tuple[str, ...]
     """What each row is called in the file, for messages."""
-    reading: Reading | None
+    reading: evidence.Reading | None
     """How the file's own tool poses prove robot and units; None where it has none."""
     Ts_base_cam: Array | None = None
     """(N, 4, 4) camera poses that the file expects [m], NaN where it has none."""
 
 
 def read_path(
-    path: Path | str, chain: DhChain | None, joints_unit: JointUnit | None = None
+    path: Path | str, chain: DhChain | None, joints_unit: evidence.JointUnit | None = None
 ) -> JointPath:
     """Return the joint path of a .json or .csv file.
 
@@ -96,7 +91,7 @@ def _check_count(path: Path, count: int, chain: DhChain | None) -> None:
         )
 
 
-def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> JointPath:
+def _json_path(path: Path, chain: DhChain | None, unit: evidence.JointUnit | None) -> JointPath:
     """Return a path of lists `joints`, `cart_pose` (x y z, rotation vector a b c), `via_points`."""
     data = read_json(path, most_bytes=LARGEST_BYTES)
     if not isinstance(data, dict) or "joints" not in data:
@@ -119,7 +114,7 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
                 f"{path} does not say whether its joints are degrees or radians: it has no "
                 "'cart_pose' that would prove it. Give it with --joints-unit."
             )
-        check_joint_unit(rows, unit, list(names), str(path))
+        evidence.check_joint_unit(rows, unit, list(names), str(path))
         q = rows if unit == "rad" else np.radians(rows)
         return JointPath(source=str(path), joints=q, via=via, rows=names, reading=None)
     try:
@@ -134,7 +129,7 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
         raise InputError(f"{path} has {len(rows)} joint rows and {len(pose)} in 'cart_pose'.")
     Ts = np.tile(np.eye(4), (len(pose), 1, 1))
     Ts[:, :3, :3], Ts[:, :3, 3] = se3.exp_so3(pose[:, 3:]), pose[:, :3]
-    reading = proven_reading(rows, Ts, chain, str(path))
+    reading = evidence.proven_reading(rows, Ts, chain, str(path))
     if unit is not None and unit != reading.joint_unit:
         raise UnitError(
             f"{path}: its joints were said to be in {unit}, but with its tool poses they fit "
@@ -144,7 +139,7 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
     return JointPath(source=str(path), joints=q, via=via, rows=names, reading=reading)
 
 
-def _csv_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> JointPath:
+def _csv_path(path: Path, chain: DhChain | None, unit: evidence.JointUnit | None) -> JointPath:
     """Return a path of columns q1_rad ... qn_rad (or _deg) and, if there is one, `via`."""
     table, lines = _csv_table(path)
     header = list(table)
@@ -152,7 +147,7 @@ def _csv_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Join
     _check_count(path, len(columns), chain)
     names = tuple(f"line {n}" for n in lines)
     rows = np.stack([_numbers(path, table[c], c, lines) for c in columns], axis=-1)
-    check_joint_unit(rows, unit, list(names), str(path))
+    evidence.check_joint_unit(rows, unit, list(names), str(path))
     q = rows if unit == "rad" else np.radians(rows)
     via = np.zeros(len(q), dtype=bool)
     if "via" in header:
@@ -201,8 +196,8 @@ def _csv_table(path: Path) -> tuple[dict[str, list[str]], list[int]]:
 
 
 def _joint_columns(
-    path: Path, header: list[str], unit: JointUnit | None
-) -> tuple[list[str], JointUnit]:
+    path: Path, header: list[str], unit: evidence.JointUnit | None
+) -> tuple[list[str], evidence.JointUnit]:
     """Return the names of the joints' columns and their unit."""
     found: dict[int, tuple[str, str]] = {}
     for name in header:
@@ -223,7 +218,7 @@ def _joint_columns(
                 "q1_deg, or say it with --joints-unit."
             )
         return [found[j][0] for j in numbers], unit
-    units: set[JointUnit | None] = {UNIT_NAMES.get(u) for u in said}
+    units: set[evidence.JointUnit | None] = {UNIT_NAMES.get(u) for u in said}
     named = units.pop()
     if units or named is None:
         raise UnitError(

@@ -17,12 +17,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.robots.arm import known_chains
 from realsim.untrusted.json_text import read_json
-from realsim_capture_plans.plan_files.evidence import (
-    MILLIMETRES_FROM_M,
-    check_joint_unit,
-    same_arm,
-    why_poses_disagree,
-)
+from realsim_capture_plans.plan_files import evidence
 from realsim_capture_plans.planning.record import (
     CapturePlan,
     hash_of,
@@ -158,7 +153,7 @@ def _check_units(content: dict[str, Any], source: str) -> None:
                 "will drive it: `realsim plan --arm`."
             )
     joints = np.array(rows, dtype=np.float64)
-    check_joint_unit(joints, "rad", names, source)
+    evidence.check_joint_unit(joints, "rad", names, source)
     lengths = {
         "center_world": np.array(content["center_world"], dtype=np.float64),
         "the mount's T_ee_cam": np.array(content["mount"]["T_ee_cam"], dtype=np.float64)[:3, 3],
@@ -171,7 +166,7 @@ def _check_units(content: dict[str, Any], source: str) -> None:
         "dh d": np.array(content["dh"]["d"], dtype=np.float64),
     }
     for name, length in lengths.items():
-        if np.any(np.abs(length) > MILLIMETRES_FROM_M):
+        if np.any(np.abs(length) > evidence.MILLIMETRES_FROM_M):
             raise UnitError(
                 f"{source}: {name} is {length.tolist()} m, farther than any arm reaches. "
                 "These look like millimetres; write metres."
@@ -183,8 +178,8 @@ def _check_model(plan: CapturePlan, source: str) -> None:
     arms = known_chains(plan.chain.joints)
     if plan.robot not in arms:
         return
-    if not same_arm(plan.chain, arms[plan.robot]):
-        alike = [name for name in arms if same_arm(plan.chain, arms[name])]
+    if not evidence.same_arm(plan.chain, arms[plan.robot]):
+        alike = [name for name in arms if evidence.same_arm(plan.chain, arms[name])]
         whose = f"those of a {alike[0]}" if alike else "of no known model"
         raise InputError(
             f"{source} says that its robot is a {plan.robot}, but its DH numbers are {whose}. "
@@ -208,10 +203,10 @@ def _check_poses(plan: CapturePlan, expected: dict[str, Any], source: str) -> No
             continue
         if what == "camera":
             why = f"the mount '{plan.mount.name}' is not the one that the poses were made with"
-            if np.abs(written[:, :3, 3]).max() > MILLIMETRES_FROM_M:
+            if np.abs(written[:, :3, 3]).max() > evidence.MILLIMETRES_FROM_M:
                 why = "the poses are in millimetres; metres are needed"
         else:
-            why = why_poses_disagree(plan.joints, written, plan.chain)
+            why = evidence.why_poses_disagree(plan.joints, written, plan.chain)
         k = int(np.argmax(gap))
         raise InputError(
             f"{source}: the {what} poses do not follow from the joints of its {plan.robot}: "

@@ -15,17 +15,10 @@ from realsim.errors import InputError
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
 from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning import viewpoints
 from realsim_capture_plans.planning.elbow import bend, reach_m
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
-from realsim_capture_plans.planning.viewpoints import (
-    better_elbow,
-    cap_rim,
-    golden_cap,
-    hemisphere_poses,
-    reachable,
-    thin_directions,
-)
 
 DISTANCES_M = (0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60)
 """Distances of the scene's centre from the base's axis that are tried."""
@@ -179,16 +172,19 @@ def _placement(
     model = CollisionModel(chain, mount, here.work_cell(center, "hemisphere"), here.clearance_m)
     count = max(least_directions, n)
     directions = np.concatenate(
-        [golden_cap(count, here.elevation_deg), cap_rim(count, here.elevation_deg)]
+        [
+            viewpoints.golden_cap(count, here.elevation_deg),
+            viewpoints.cap_rim(count, here.elevation_deg),
+        ]
     )
-    poses, item = hemisphere_poses(center, directions, here.radius_m, poses_each, 0.0)
-    found = reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
-    one_side = found.where(bend(chain, found.joints) * better_elbow(found, chain) > 0)
+    poses, item = viewpoints.hemisphere_poses(center, directions, here.radius_m, poses_each, 0.0)
+    found = viewpoints.reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
+    one_side = found.where(bend(chain, found.joints) * viewpoints.better_elbow(found, chain) > 0)
     holes: list[float] = []
     for ok in (np.unique(found.item), np.unique(one_side.item)):
         hole = NO_PLAN_DEG
         if len(ok) >= n:
-            chosen = directions[ok][thin_directions(directions[ok], n, directions)]
+            chosen = directions[ok][viewpoints.thin_directions(directions[ok], n, directions)]
             hole = hole_deg(chosen, here.elevation_deg)
         holes.append(hole)
     return Placement(

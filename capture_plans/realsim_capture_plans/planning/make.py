@@ -20,6 +20,7 @@ from realsim.robots.arm import UR5
 from realsim.robots.inverse import CLOSED, held_joint
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
+from realsim_capture_plans.planning import viewpoints
 from realsim_capture_plans.planning.advise import better_place
 from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.metrics import plan_metrics
@@ -29,23 +30,6 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.task import PlanTask, Progress, plan_task, seen_share
 from realsim_capture_plans.planning.tour_search import held_karp_bound, two_nearest_bound
 from realsim_capture_plans.planning.view_quality import nearest_deg
-from realsim_capture_plans.planning.viewpoints import (
-    Candidates,
-    better_elbow,
-    board_poses,
-    board_roll,
-    cap_rim,
-    choose_home,
-    golden_cap,
-    hemisphere_poses,
-    look_at_poses,
-    on_one_elbow,
-    plane_axes,
-    preferred,
-    spread_rolls,
-    thin_directions,
-    with_turns,
-)
 
 Ints = NDArray[np.intp]
 SECOND_TRY = 6
@@ -99,17 +83,17 @@ def hemisphere_plan(
     ):
         one_side = strict
 
-    def more(chosen: Ints) -> Candidates:
+    def more(chosen: Ints) -> viewpoints.Candidates:
         """Return the candidates of the chosen directions, tried more densely."""
-        poses, item = hemisphere_poses(
+        poses, item = viewpoints.hemisphere_poses(
             task.center, directions[chosen], config.radius_m, _poses(task, config.dense_poses), 0.5
         )
         dense = task.reach(poses, chosen[item], "more ways to the chosen views")
-        both = on_one_elbow(one_side.joined(dense), chain, side)
-        return preferred(both, seen_share(both.Ts_base_cam, task) >= config.seen_share)
+        both = viewpoints.on_one_elbow(one_side.joined(dense), chain, side)
+        return viewpoints.preferred(both, seen_share(both.Ts_base_cam, task) >= config.seen_share)
 
     def choose(ok: Ints) -> Ints:
-        return ok[thin_directions(directions[ok], n, directions)]
+        return ok[viewpoints.thin_directions(directions[ok], n, directions)]
 
     def between(direction: Ints, joints: Array) -> tuple[Array, Ints]:
         """Return candidates (K, n) near joints (N, n), and the row that each belongs to."""
@@ -123,31 +107,33 @@ def hemisphere_plan(
     return replace(plan, metrics=plan.metrics | found_here)
 
 
-def _largest_hole(directions: Array, items: Ints, found: Candidates, n: int) -> float:
+def _largest_hole(directions: Array, items: Ints, found: viewpoints.Candidates, n: int) -> float:
     """Return the hole [deg] that n of the found items leave among all that are reachable."""
     ok = np.unique(found.item)
     if len(ok) < n:
         return np.inf
-    chosen = directions[ok][thin_directions(directions[ok], n, directions)]
+    chosen = directions[ok][viewpoints.thin_directions(directions[ok], n, directions)]
     return float(nearest_deg(chosen, directions[items]).max())
 
 
-def reachable_directions(task: PlanTask, n: int) -> tuple[Array, Candidates]:
+def reachable_directions(task: PlanTask, n: int) -> tuple[Array, viewpoints.Candidates]:
     """Return the directions (D, 3) that are tried for n views, and what reaches them."""
     config = task.config
     spin = se3.exp_so3([0.0, 0.0, task.rng.uniform(0.0, 2 * np.pi)])
     tried = max(config.oversampling * n, config.least_directions)
-    cap = golden_cap(tried, config.elevation_deg)
+    cap = viewpoints.golden_cap(tried, config.elevation_deg)
     # The spiral ends half a turn short of the rim, where the cells of its last views reach out.
-    directions = np.concatenate([cap, cap_rim(tried, config.elevation_deg)]) @ spin.T
+    directions = np.concatenate([cap, viewpoints.cap_rim(tried, config.elevation_deg)]) @ spin.T
     tried = len(directions)
     per_direction = _poses(task, config.poses_per_direction)
-    poses, item = hemisphere_poses(task.center, directions, config.radius_m, per_direction, 0.0)
+    poses, item = viewpoints.hemisphere_poses(
+        task.center, directions, config.radius_m, per_direction, 0.0
+    )
     found = task.reach(poses, item, "which directions are reachable")
     missed = np.setdiff1d(np.arange(tried), found.item)
     if len(missed) and len(missed) < tried * MOST_MISSED:
         # A direction may be reachable by a roll or a radius that was not tried.
-        poses, item = hemisphere_poses(
+        poses, item = viewpoints.hemisphere_poses(
             task.center, directions[missed], config.radius_m, SECOND_TRY * len(poses) // tried, 0.5
         )
         second = task.reach(poses, missed[item], "a second try at the rest")
@@ -201,13 +187,13 @@ def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
     if normal.shape != (3,) or not length > 0:
         raise InputError(f"the board's normal is {normal.tolist()}; a direction (3,) is needed.")
     tried = max(config.board_oversampling * n, config.least_directions)
-    poses, features = board_poses(tried, task.center, normal / length, config, rng)
+    poses, features = viewpoints.board_poses(tried, task.center, normal / length, config, rng)
     found = task.reach(poses, np.arange(tried), "which board views are reachable")
-    roll = board_roll(poses, plane_axes(normal / length))
+    roll = viewpoints.board_roll(poses, viewpoints.plane_axes(normal / length))
     home, one_side = _home(task, found, n, tried)
 
     def choose(ok: Ints) -> Ints:
-        return ok[spread_rolls(features[ok], roll[ok], n)]
+        return ok[viewpoints.spread_rolls(features[ok], roll[ok], n)]
 
     plan = _driven(task, one_side, home, n, choose, lambda _: one_side)
     board = plan_metrics(plan, task.model, board_normal=normal)
@@ -231,7 +217,9 @@ def _too_few(task: PlanTask, n: int, reachable_count: int, tried: int) -> str:
     )
 
 
-def _home(task: PlanTask, found: Candidates, n: int, tried: int) -> tuple[Array, Candidates]:
+def _home(
+    task: PlanTask, found: viewpoints.Candidates, n: int, tried: int
+) -> tuple[Array, viewpoints.Candidates]:
     """Return where the tour begins, and the candidates on one side of the elbow where there are.
 
     Raises:
@@ -241,17 +229,17 @@ def _home(task: PlanTask, found: Candidates, n: int, tried: int) -> tuple[Array,
     if count < n:
         raise DegenerateError(_too_few(task, n, count, tried))
     chain = task.model.chain
-    one_side = on_one_elbow(found, chain, better_elbow(found, chain))
-    return choose_home(one_side, chain), one_side
+    one_side = viewpoints.on_one_elbow(found, chain, viewpoints.better_elbow(found, chain))
+    return viewpoints.choose_home(one_side, chain), one_side
 
 
 def _driven(
     task: PlanTask,
-    found: Candidates,
+    found: viewpoints.Candidates,
     home: Array,
     n: int,
     choose: Callable[[Ints], Ints],
-    more: Callable[[Ints], Candidates],
+    more: Callable[[Ints], viewpoints.Candidates],
     between: Callable[[Ints, Array], tuple[Array, Ints]] | None = None,
 ) -> CapturePlan:
     """Return the plan of n chosen items: an order, a candidate of each, and free moves between.
@@ -281,7 +269,7 @@ def _driven(
             np.searchsorted(candidates.item[order], np.unique(candidates.item))[1:],
         )
         by_item = dict(zip(np.unique(candidates.item).tolist(), rows, strict=True))
-        near = [with_turns(by_item[i], home, chain, config) for i in chosen.tolist()]
+        near = [viewpoints.with_turns(by_item[i], home, chain, config) for i in chosen.tolist()]
         task.progress("order and moves", 0, 1)
         closer = None if between is None else partial(closer_candidates, between, chosen, home)
         try:
@@ -371,10 +359,10 @@ def nearest_views(task: PlanTask, directions: Array, joints: Array) -> tuple[Arr
     Ts = chain.forward(joints) @ task.mount.T_ee_cam
     radius = np.clip(np.linalg.norm(Ts[:, :3, 3] - task.center, axis=-1), *config.radius_m)
     eyes = task.center + radius[:, None] * directions
-    upright = look_at_poses(eyes, task.center, np.zeros(len(eyes)))
+    upright = viewpoints.look_at_poses(eyes, task.center, np.zeros(len(eyes)))
     turn = np.swapaxes(upright[:, :3, :3], -1, -2) @ Ts[:, :3, :3]
     roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
-    poses = look_at_poses(eyes, task.center, roll)
+    poses = viewpoints.look_at_poses(eyes, task.center, roll)
     good = np.flatnonzero(seen_share(poses, task) >= config.seen_share)
     Ts_base_ee = poses[good] @ se3.invert(task.mount.T_ee_cam)
     if chain.joints > CLOSED:  # of all ways to hold a redundant arm the nearest

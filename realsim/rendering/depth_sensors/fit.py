@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.autocovariance import (
-    TRENDS_PX,
-    NoiseShape,
-    fit_noise,
-    steady_sums,
-    without_trend,
-)
+from realsim.rendering.depth_sensors import autocovariance
 from realsim.rendering.depth_sensors.edges import edges_of
 from realsim.rendering.depth_sensors.fit_resimulated import (
     resampling_pitch,
@@ -188,19 +182,19 @@ def _of_planes(
     step = disparity_step(on_plane, intrinsics, kind.baseline_m, unit)
     bands = bands_of(planes)
     flat = [without_bands(p, bands) for p in planes]
-    sums, trend = steady_sums(flat)
+    sums, trend = autocovariance.steady_sums(flat)
     if len(sums.products) == 0:
         raise InputError(
             "the planes are too small or too torn to measure noise on: no square of 64x64 px is a "
             "fifth full. Go nearer, or take a larger wall."
         )
-    fast = [without_trend(r, trend)[0] for r in flat]
+    fast = [autocovariance.without_trend(r, trend)[0] for r in flat]
     shown = [_frame(*x, fB) for x in zip(names, planes, fast, strict=True)]
     found = _step_estimate(step, kind)
     rounding = _rounding(found["quantum_px"].value, unit, fB, planes)
-    shape, spread = fit_noise(sums, rounding, trend)
+    shape, spread = autocovariance.fit_noise(sums, rounding, trend)
     notes: list[str] = []
-    if trend < TRENDS_PX[0]:
+    if trend < autocovariance.TRENDS_PX[0]:
         notes.append(
             f"the surfaces are not flat to the noise: only what is faster than {trend:.0f} px "
             "was taken for noise. A flatter wall says more."
@@ -289,8 +283,8 @@ def _frame(name: str, plane: PlaneView, fast: Array32, fB: float) -> FrameFit:
 
 
 def _noise_estimates(
-    shape: NoiseShape,
-    spread: NoiseShape | None,
+    shape: autocovariance.NoiseShape,
+    spread: autocovariance.NoiseShape | None,
     frames: Sequence[FrameFit],
     step: Step,
     rounding: float,
@@ -303,7 +297,7 @@ def _noise_estimates(
             f"the planes fill only {tiles} squares of 64 px; {LEAST_TILES} are needed to "
             "know the noise and its uncertainty. Go nearer, or add frames."
         )
-    u = spread or NoiseShape(
+    u = spread or autocovariance.NoiseShape(
         sigma_px=np.inf, radius_px=np.inf, aspect=np.inf, slow_sigma_px=np.inf, slow_radius_px=0.0
     )
     frame_sigmas = [f.sigma_px for f in frames]

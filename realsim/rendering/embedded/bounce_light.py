@@ -9,13 +9,7 @@ import numpy as np
 
 from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
-from realsim.rendering.embedded.sky_light import (
-    SkyArrays,
-    coarse_at,
-    lamp_direction,
-    map_at,
-    ray_weight,
-)
+from realsim.rendering.embedded import sky_light
 from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints
 from realsim.rendering.embedded.texture_atlas import TextureArrays, color_at, footprint
 
@@ -68,7 +62,7 @@ def _leave(
 
 @njit(error_model="numpy")
 def ambient_rays(
-    sky: SkyArrays,
+    sky: sky_light.SkyArrays,
     points: SurfacePoints,
     cells: tuple[Int64, int, int],
     lift: float,
@@ -94,7 +88,7 @@ def ambient_rays(
             j = m * n + k
             aimed = u1 < sky.lamp_rays
             if aimed:
-                x, y, z = lamp_direction(sky, u1 / sky.lamp_rays, u2)
+                x, y, z = sky_light.lamp_direction(sky, u1 / sky.lamp_rays, u2)
             else:
                 u1 = (u1 - sky.lamp_rays) / (1.0 - sky.lamp_rays)
                 radius, phi = np.sqrt(u1), 2 * np.pi * u2
@@ -102,14 +96,14 @@ def ambient_rays(
                 x = p * ax + q * bx + h * sx
                 y = p * ay + q * by + h * sy
                 z = p * az + q * bz + h * sz
-            weights[j] = ray_weight(sky, (x, y, z), x * sx + y * sy + z * sz)
+            weights[j] = sky_light.ray_weight(sky, (x, y, z), x * sx + y * sy + z * sz)
             # It may be below the face although above the interpolated surface.
             _leave(points, i, (x, y, z), lift, (origins, directions), j)
 
 
 @njit(error_model="numpy")
 def sun_rays(
-    sky: SkyArrays,
+    sky: sky_light.SkyArrays,
     points: SurfacePoints,
     which: tuple[Int64, Int64, int, int],
     lift: float,
@@ -169,7 +163,7 @@ def mirror_rays(
 
 
 @njit(error_model="numpy")
-def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
+def face_light(sky: sky_light.SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
     """Fill what each face sends on (F, 6): under the open sky, and added where the sun shines."""
     for g in range(len(surfaces.base)):
         for f in range(surfaces.first_face[g], surfaces.first_face[g + 1]):
@@ -179,7 +173,7 @@ def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
             x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             length = max(np.sqrt(x * x + y * y + z * z), 1e-30)
             x, y, z = x / length, y / length, z / length
-            light = map_at(sky.irradiance, 0, x, y, z)
+            light = sky_light.map_at(sky.irradiance, 0, x, y, z)
             s = sky.sun_direction
             facing = max(x * s[0] + y * s[1] + z * s[2], 0.0)
             for k in range(3):
@@ -189,7 +183,7 @@ def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
 
 @njit(error_model="numpy")
 def gather_ambient(
-    sky: SkyArrays,
+    sky: sky_light.SkyArrays,
     face_radiance: Array32,
     rays: tuple[Array32, Array32, Int32, Mask],
     cells: tuple[Int64, int],
@@ -215,7 +209,9 @@ def gather_ambient(
             w = weights[j]
             if w <= 0:
                 continue
-            light = w * coarse_at(sky.coarse, directions[j, 0], directions[j, 1], directions[j, 2])
+            light = w * sky_light.coarse_at(
+                sky.coarse, directions[j, 0], directions[j, 1], directions[j, 2]
+            )
             whole += light
             f = face[j]
             if f < 0:

@@ -17,15 +17,7 @@ from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
 from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
-from realsim.rendering.embedded import bounce_light
-from realsim.rendering.embedded.ambient_cells import (
-    CELL_PX,
-    cell_pixels,
-    divide_by_whole,
-    edge_filtered,
-    spread_cells,
-    taken,
-)
+from realsim.rendering.embedded import ambient_cells, bounce_light
 from realsim.rendering.embedded.edge_samples import (
     borrow_light,
     busy_pixels,
@@ -212,20 +204,22 @@ class EnvironmentRenderer:
     def _ambient(self, seen: _Seen, height: int, width: int) -> Array32:
         """Return the light (N, 4) from sky and neighbours on each point, and the open share."""
         n = self._sampling.ambient_rays
-        pixels = cell_pixels(seen.geometry, height, width)
-        points, geometry = taken(seen.points, pixels), seen.geometry[pixels]
-        columns = -(-width // CELL_PX)
+        pixels = ambient_cells.cell_pixels(seen.geometry, height, width)
+        points, geometry = ambient_cells.taken(seen.points, pixels), seen.geometry[pixels]
+        columns = -(-width // ambient_cells.CELL_PX)
         size = (len(pixels) // columns, columns)
         gathered = np.zeros((len(pixels), 5), np.float32)
         gathered[:, :2] = 1.0
         if n:
             self._gather(points, np.flatnonzero(geometry >= 0), columns, gathered)
             for taps in FILTER_TAPS:
-                gathered = edge_filtered(gathered, points, geometry, size, taps)
-                divide_by_whole(gathered)
+                gathered = ambient_cells.edge_filtered(gathered, points, geometry, size, taps)
+                ambient_cells.divide_by_whole(gathered)
         out = np.zeros((len(seen.geometry), 4), np.float32)
         cells = (points, geometry, gathered)
-        spread_cells(self._sky, cells, (seen.points, seen.geometry), (height, width), out)
+        ambient_cells.spread_cells(
+            self._sky, cells, (seen.points, seen.geometry), (height, width), out
+        )
         return out
 
     def _gather(self, points: SurfacePoints, rows: Rows, columns: int, out: Array32) -> None:

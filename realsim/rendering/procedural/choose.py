@@ -14,20 +14,7 @@ import numpy as np
 from realsim.arrays import Array32, Int64
 from realsim.errors import InputError
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.procedural import fabrics, minerals
-from realsim.rendering.procedural.noise import (
-    Tint,
-    blurred,
-    fine,
-    finished,
-    fractal,
-    grid,
-    mixed,
-    random_tint,
-    shaded,
-    smooth,
-    step,
-)
+from realsim.rendering.procedural import fabrics, minerals, noise
 from realsim.rendering.procedural.rooms import room
 from realsim.rendering.procedural.skies import balanced, exposed, overcast_sky, sunny_sky
 
@@ -41,9 +28,9 @@ class Timber:
     """What tells one kind of wood from another."""
 
     name: str
-    early: Tint
+    early: noise.Tint
     """sRGB of the light wood of spring."""
-    late: Tint
+    late: noise.Tint
     """sRGB of the dark line that ends the year."""
     rings_per_m: float
     """Growth rings across a board."""
@@ -76,23 +63,23 @@ def _boards(rng: np.random.Generator, timber: Timber) -> Material:
     n = WOOD_PX
     period_m = float(rng.uniform(0.45, 0.75))
     count = int(rng.integers(3, 7))
-    u, v = grid(n)
+    u, v = noise.grid(n)
     board, across = _board_of(rng, v, count)
     rings = _rings(rng, u, across, board, count, timber.rings_per_m * period_m)
     year = rings - np.floor(rings)
     # Spring wood darkens slowly; the year ends at once.
-    line = (year**2.2 * step(1.0 - year, 0.0, 0.12)).astype(np.float32)
-    fibre = smooth(rng, n, 7.0, 260.0)
-    tone = timber.contrast * line + 0.07 * fibre + 0.09 * smooth(rng, n, 2.0, 30.0)
-    color = mixed(timber.early, timber.late, (0.08 + tone).astype(np.float32))
+    line = (year**2.2 * noise.step(1.0 - year, 0.0, 0.12)).astype(np.float32)
+    fibre = noise.smooth(rng, n, 7.0, 260.0)
+    tone = timber.contrast * line + 0.07 * fibre + 0.09 * noise.smooth(rng, n, 2.0, 30.0)
+    color = noise.mixed(timber.early, timber.late, (0.08 + tone).astype(np.float32))
 
     pore = np.zeros((n, n), np.float32)
     if timber.pores > 0:
-        streak = smooth(rng, n, 0.5 * period_m / timber.pore_m, 340.0)
+        streak = noise.smooth(rng, n, 0.5 * period_m / timber.pore_m, 340.0)
         # Ring-porous wood has its pores where the year begins.
         needed = np.float32(2.6 - 2.2 * timber.pores) + 0.9 * np.minimum(year / 0.45, 1.0)
-        pore = step(streak - needed.astype(np.float32), 0.0, 0.8)
-        color = mixed(color, 0.62 * np.asarray(timber.late), 0.8 * pore)
+        pore = noise.step(streak - needed.astype(np.float32), 0.0, 0.8)
+        color = noise.mixed(color, 0.62 * np.asarray(timber.late), 0.8 * pore)
     tint = 1.0 + 0.075 * rng.standard_normal((count, 1)) + 0.02 * rng.standard_normal((count, 3))
     color *= tint[board[:, 0]][:, None, :].astype(np.float32)
     line_between = (board != np.roll(board, 1, 0)).astype(np.float32)
@@ -101,10 +88,10 @@ def _boards(rng: np.random.Generator, timber: Timber) -> Material:
 
     roughness = float(rng.uniform(0.28, 0.6)) / 0.8
     height = -6e-5 * pore - 1.2e-4 * joint - 1.5e-5 * line + 4e-6 * fibre
-    return finished(
+    return noise.finished(
         timber.name, period_m, color, roughness,
         gloss=0.80 + 0.05 * fibre + 0.2 * pore + 0.2 * joint,
-        height_m=blurred(height.astype(np.float32), 0.8),
+        height_m=noise.blurred(height.astype(np.float32), 0.8),
     )  # fmt: skip
 
 
@@ -129,7 +116,7 @@ def _rings(
         size = rng.normal(0.0, 0.30 / waves**1.4, (count, 1))[board[:, 0]]
         phase = rng.uniform(0, 2 * np.pi, (count, 1))[board[:, 0]]
         depth += (size * np.sin(2 * np.pi * waves * u + phase)).astype(np.float32)
-    wobble = 0.035 * smooth(rng, n, 3.0, 8.0) + 0.006 * smooth(rng, n, 14.0, 30.0)
+    wobble = 0.035 * noise.smooth(rng, n, 3.0, 8.0) + 0.006 * noise.smooth(rng, n, 14.0, 30.0)
     lift = rng.uniform(0.25, 0.8, (count, 1))[board[:, 0]]
     sideways = (across - axis).astype(np.float32) + wobble
     radius = np.sqrt(sideways**2 + (depth + lift).astype(np.float32) ** 2)
@@ -137,7 +124,7 @@ def _rings(
     return (radius * (per_tile / count) + start).astype(np.float32)
 
 
-LAMINATES: tuple[tuple[str, Tint], ...] = (
+LAMINATES: tuple[tuple[str, noise.Tint], ...] = (
     ("white", (236, 236, 232)), ("light grey", (200, 203, 205)), ("grey", (146, 150, 153)),
     ("anthracite", (62, 65, 69)), ("black", (34, 34, 36)), ("beige", (216, 203, 180)),
     ("blue grey", (126, 146, 164)), ("sage", (150, 166, 146)),
@@ -148,22 +135,22 @@ def laminate(rng: np.random.Generator) -> Material:
     """Return a laminated board: one colour, hardly any pattern, the fine grain of the press."""
     n = LAMINATE_PX
     name, tint = LAMINATES[int(rng.integers(len(LAMINATES)))]
-    speckle = fine(rng, n, 60.0)
-    cloud = fractal(rng, n, 1.6)
-    color = shaded(rng, tint, 4.0) + (1.4 * speckle + 1.8 * cloud)[..., None]
-    height = 6e-6 * fine(rng, n, 130.0) + 6e-6 * smooth(rng, n, 40.0)
-    return finished(f"{name} laminate", 0.25, color, rng.uniform(0.22, 0.55), height_m=height)
+    speckle = noise.fine(rng, n, 60.0)
+    cloud = noise.fractal(rng, n, 1.6)
+    color = noise.shaded(rng, tint, 4.0) + (1.4 * speckle + 1.8 * cloud)[..., None]
+    height = 6e-6 * noise.fine(rng, n, 130.0) + 6e-6 * noise.smooth(rng, n, 40.0)
+    return noise.finished(f"{name} laminate", 0.25, color, rng.uniform(0.22, 0.55), height_m=height)
 
 
 def painted_wood(rng: np.random.Generator) -> Material:
     """Return wood under paint: the colour of the paint, the relief of the grain."""
     n, period_m = LAMINATE_PX, float(rng.uniform(0.3, 0.5))
-    grain = smooth(rng, n, 4.0, 110.0)
-    stroke = smooth(rng, n, 3.0, 60.0)
-    tint = np.asarray(random_tint(rng, (0.1, 0.55), (0.45, 0.95)), np.float32)
+    grain = noise.smooth(rng, n, 4.0, 110.0)
+    stroke = noise.smooth(rng, n, 3.0, 60.0)
+    tint = np.asarray(noise.random_tint(rng, (0.1, 0.55), (0.45, 0.95)), np.float32)
     color = tint + (1.2 * stroke - 3.5 * np.maximum(grain - 0.8, 0))[..., None]
     height = -3.0e-5 * np.maximum(grain - 0.3, 0) + 1.0e-5 * stroke
-    return finished(
+    return noise.finished(
         "painted wood", period_m, color, rng.uniform(0.3, 0.6),
         gloss=0.9 + 0.05 * grain, height_m=height,
     )  # fmt: skip

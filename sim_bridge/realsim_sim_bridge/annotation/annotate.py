@@ -31,7 +31,7 @@ from realsim.store import SessionStore
 from realsim.store.atomic import npz_bytes
 from realsim.store.session_store import depth_path
 from realsim.untrusted.own_json import to_json
-from realsim_sim_bridge.annotation import files
+from realsim_sim_bridge.annotation import files, frame_labels, unmodelled
 from realsim_sim_bridge.annotation.config import AnnotationConfig
 from realsim_sim_bridge.annotation.files import (
     OBJECTS_FILE,
@@ -39,13 +39,6 @@ from realsim_sim_bridge.annotation.files import (
     GraspVisibility,
     grasps_in_view,
     surface_path,
-)
-from realsim_sim_bridge.annotation.frame_labels import (
-    DepthAgreement,
-    UnknownOccluder,
-    depth_agreement,
-    label_object,
-    unknown_occluder,
 )
 from realsim_sim_bridge.annotation.frame_maps import map_files
 from realsim_sim_bridge.annotation.inputs import (
@@ -56,13 +49,6 @@ from realsim_sim_bridge.annotation.inputs import (
     gathered,
 )
 from realsim_sim_bridge.annotation.summary import AnnotationSummary, numbers, summary_of
-from realsim_sim_bridge.annotation.unmodelled import (
-    ObjectMasks,
-    UnmodelledRegion,
-    object_masks,
-    union_of,
-    unmodelled_region,
-)
 
 Depth = Array32
 
@@ -77,7 +63,7 @@ class FrameFiles:
     """The annotation as JSON values."""
 
 
-Evidence = tuple[DepthAgreement, UnknownOccluder]
+Evidence = tuple[frame_labels.DepthAgreement, frame_labels.UnknownOccluder]
 """How the measured depth bears out an object's mask, and what hides it that is not in the scene."""
 
 
@@ -110,7 +96,7 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
     (all_masks, evidence, region), boxes = _seen(inputs, labels, depth_m), boxes_of(inputs)
     own_boxes = boxes[: len(inputs.objects)]
     frame = [
-        label_object(
+        frame_labels.label_object(
             placed, (inputs.models[placed.obj_id].mesh, box), masks, labels, depth_m,
             (intrinsics, view.T_world_cam), said,
         )
@@ -140,20 +126,24 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
 
 def _seen(
     inputs: FrameInputs, labels: Labels, depth_m: Depth
-) -> tuple[list[ObjectMasks], list[Evidence], UnmodelledRegion | None]:
+) -> tuple[list[unmodelled.ObjectMasks], list[Evidence], unmodelled.UnmodelledRegion | None]:
     """Return the masks of all objects, checked against the measured depth, and what hides them."""
     config, instances = inputs.config, [o.instance for o in inputs.objects]
-    masks = [object_masks(labels, i) for i in instances]
-    window = union_of([m.window for m in masks])
-    region = unmodelled_region(labels.depth_m, depth_m, window, inputs.intrinsics, config.occluder)
+    masks = [unmodelled.object_masks(labels, i) for i in instances]
+    window = unmodelled.union_of([m.window for m in masks])
+    region = unmodelled.unmodelled_region(
+        labels.depth_m, depth_m, window, inputs.intrinsics, config.occluder
+    )
     evidence: list[Evidence] = []
     for k, i in enumerate(instances):
         rendered_m, measured_m = labels.depth_m[masks[k].window], depth_m[masks[k].window]
-        agreement = depth_agreement(
+        agreement = frame_labels.depth_agreement(
             masks[k].rendered, rendered_m, measured_m, config.agreement_tolerance_m
         )
-        covered = object_masks(labels, i, region)
-        unknown = unknown_occluder(covered, rendered_m, measured_m, agreement, config.occluder)
+        covered = unmodelled.object_masks(labels, i, region)
+        unknown = frame_labels.unknown_occluder(
+            covered, rendered_m, measured_m, agreement, config.occluder
+        )
         evidence.append((agreement, unknown))
         if unknown.is_removed:
             masks[k] = covered

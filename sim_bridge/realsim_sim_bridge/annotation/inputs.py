@@ -7,20 +7,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from realsim import images
+from realsim import images, records
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.mesh import box_mesh
-from realsim.records import (
-    CameraIntrinsics,
-    GraspSet,
-    Mesh,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    View,
-    names_of,
-)
 from realsim.records.grasps import LABEL_MEASURES
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
@@ -37,14 +27,14 @@ class FrameInputs:
     """What all views of a session have in common; it can be sent to another process."""
 
     config: AnnotationConfig
-    intrinsics: CameraIntrinsics
+    intrinsics: records.CameraIntrinsics
     depth_unit_m: float
     """Metres per count of the session's depth images."""
-    objects: tuple[ObjectPose, ...]
+    objects: tuple[records.ObjectPose, ...]
     """The objects that are annotated, in the order of the masks."""
-    models: Mapping[int, ObjectModel]
+    models: Mapping[int, records.ObjectModel]
     """obj_id -> model of these objects."""
-    grasp_sets: tuple[GraspSet, ...]
+    grasp_sets: tuple[records.GraspSet, ...]
     surroundings: tuple[PlacedMesh, ...]
     """What hides things without carrying a label: the table."""
     digest: str
@@ -70,9 +60,9 @@ class FrameView:
 
 def gathered(
     store: SessionStore,
-    scene: Scene,
-    models: Mapping[int, ObjectModel],
-    grasp_sets: Sequence[GraspSet],
+    scene: records.Scene,
+    models: Mapping[int, records.ObjectModel],
+    grasp_sets: Sequence[records.GraspSet],
     config: AnnotationConfig,
     surroundings: Sequence[PlacedMesh] | None = None,
 ) -> FrameInputs:
@@ -88,7 +78,7 @@ def gathered(
     if missing:
         raise InputError(
             f"scene '{scene.name}' holds objects {missing} without a model; the models given are: "
-            f"{names_of(list(models.values()))}. Put the missing ones into models/."
+            f"{records.names_of(list(models.values()))}. Put the missing ones into models/."
         )
     for g in grasp_sets:
         if scene.object(g.instance).obj_id != g.obj_id:
@@ -112,14 +102,14 @@ def gathered(
     )
 
 
-def _table(scene: Scene, config: AnnotationConfig) -> list[PlacedMesh]:
+def _table(scene: records.Scene, config: AnnotationConfig) -> list[PlacedMesh]:
     """Return the table under the plane of a registered scene, if it has one."""
     if scene.plane is None:
         return []
     return [PlacedMesh(BACKGROUND, table_slab(config), scene.plane.T_world_table)]
 
 
-def table_slab(config: AnnotationConfig) -> Mesh:
+def table_slab(config: AnnotationConfig) -> records.Mesh:
     """Return the table as a closed box under the plane z = 0 of frame `table` [m]."""
     half, top = config.table_m / 2, -config.plane_clearance_m
     return box_mesh((-half, -half, top - config.table_thickness_m), (half, half, top))
@@ -127,9 +117,9 @@ def table_slab(config: AnnotationConfig) -> Mesh:
 
 def _scene_digest(
     store: SessionStore,
-    chosen: Sequence[ObjectPose],
-    models: Mapping[int, ObjectModel],
-    grasp_sets: Sequence[GraspSet],
+    chosen: Sequence[records.ObjectPose],
+    models: Mapping[int, records.ObjectModel],
+    grasp_sets: Sequence[records.GraspSet],
     config: AnnotationConfig,
     surroundings: Sequence[PlacedMesh],
 ) -> str:
@@ -156,7 +146,7 @@ def _scene_digest(
     return digest.hexdigest()
 
 
-def frame_view(store: SessionStore, inputs: FrameInputs, view: View) -> FrameView:
+def frame_view(store: SessionStore, inputs: FrameInputs, view: records.View) -> FrameView:
     """Return a view with the digest of everything its annotation depends on.
 
     The depth enters as its file's bytes, which are a tenth of the image and need no decoding.
@@ -177,7 +167,7 @@ def frame_view(store: SessionStore, inputs: FrameInputs, view: View) -> FrameVie
     )
 
 
-def _check_size(store: SessionStore, intrinsics: CameraIntrinsics, path: str) -> None:
+def _check_size(store: SessionStore, intrinsics: records.CameraIntrinsics, path: str) -> None:
     """Raise if an image is not of the camera's size."""
     width, height = images.image_size(store.path(path))
     if (width, height) != (intrinsics.width, intrinsics.height):

@@ -15,19 +15,13 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.trajectories import GraspTrajectories
 from realsim.robots.compiled_chain import follow_lines
+from realsim_sim_bridge.arm import stage_motion
 from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, in_words
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import connect
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.reach_config import ReachConfig, base_on_table, home_joints
-from realsim_sim_bridge.arm.stage_motion import (
-    MOVED_STAGES,
-    Attempts,
-    Line,
-    StageMotions,
-    stage_motions,
-)
 from realsim_sim_bridge.arm.swept_hand import first_touched
 from realsim_sim_bridge.arm.timing import timed_path
 from realsim_sim_bridge.grasping.candidates import Surroundings
@@ -158,7 +152,7 @@ class _ReachCheck:
         wanted = self._config.with_trajectories and bool(done.any())
         motions = self._motions() if wanted else None
         n = len(done)
-        possible, notes = np.zeros((n, len(MOVED_STAGES)), dtype=np.bool_), [""] * n
+        possible, notes = np.zeros((n, len(stage_motion.MOVED_STAGES)), dtype=np.bool_), [""] * n
         if motions is not None:
             possible[done] = motions.possible
             for row, note in zip(np.nonzero(done)[0].tolist(), motions.notes, strict=True):
@@ -331,7 +325,7 @@ class _ReachCheck:
 
     # --- over time -------------------------------------------------------------------------------
 
-    def _motions(self) -> StageMotions:
+    def _motions(self) -> stage_motion.StageMotions:
         """Return all reachable grasps' attempts over time."""
         task, motion, timing = self._task, self._motion, self._config.timing
         # A slower hand than Franka's closes at its own speed.
@@ -353,8 +347,8 @@ class _ReachCheck:
         sides = _distances(2 * motion.oscillation_m, self._config)
         yes = np.ones(len(rows), dtype=np.bool_)
         x, y = (self._shaken(lifted, Ts, axis, sides) for axis in (0, 1))
-        return stage_motions(
-            Attempts(
+        return stage_motion.stage_motions(
+            stage_motion.Attempts(
                 arm=self._arm,
                 rows=rows,
                 home=self._home,
@@ -370,11 +364,11 @@ class _ReachCheck:
             timing,
         )
 
-    def _shaken(self, lifted: Array, Ts: Array, axis: int, distances: Array) -> Line:
+    def _shaken(self, lifted: Array, Ts: Array, axis: int, distances: Array) -> stage_motion.Line:
         """Return the line of the lifted hand along a table axis."""
         direction = np.tile(self._T_base_table[:3, axis], (len(lifted), 1))
         joints, slopes, inside = self._followed(lifted, Ts, direction, distances)
-        return Line(nodes=distances, joints=joints, slopes=slopes, possible=inside)
+        return stage_motion.Line(nodes=distances, joints=joints, slopes=slopes, possible=inside)
 
 
 def _distances(length_m: float, config: ReachConfig) -> Array:
@@ -382,6 +376,8 @@ def _distances(length_m: float, config: ReachConfig) -> Array:
     return np.linspace(0.0, length_m, max(round(length_m / config.step_m), 1) + 1)
 
 
-def _as_line(moves: Array, distances: Array, possible: Mask) -> Line:
+def _as_line(moves: Array, distances: Array, possible: Mask) -> stage_motion.Line:
     """Return joints and slopes (A, 2, W, n) as a line."""
-    return Line(nodes=distances, joints=moves[:, 0], slopes=moves[:, 1], possible=possible)
+    return stage_motion.Line(
+        nodes=distances, joints=moves[:, 0], slopes=moves[:, 1], possible=possible
+    )

@@ -27,6 +27,7 @@ from realsim.records.grasps import LABEL_MEASURES
 from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
+from realsim_sim_bridge.demonstrations import records
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
 from realsim_sim_bridge.demonstrations.front_view import (
     FrontView,
@@ -35,15 +36,6 @@ from realsim_sim_bridge.demonstrations.front_view import (
     wrist_camera,
 )
 from realsim_sim_bridge.demonstrations.pictures import AttemptPictures, ScenePictures, drawn_mesh
-from realsim_sim_bridge.demonstrations.records import (
-    ALL_PHASES,
-    AttemptOutcome,
-    DemonstrationCamera,
-    DemonstrationConfig,
-    DemonstrationStep,
-    GraspGoal,
-    RobotAction,
-)
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school.object_slips import stand_of
@@ -75,7 +67,7 @@ class NotAttempted:
 class Scenery:
     """What all demonstrations of a scene share."""
 
-    cameras: Mapping[str, DemonstrationCamera]
+    cameras: Mapping[str, records.DemonstrationCamera]
     models: Mapping[int, ObjectModel]
     """By instance."""
     Ts_table_obj: Mapping[int, Array]
@@ -91,8 +83,8 @@ class Demonstration:
     """One attempt, replayed; its pictures are rendered when they are asked for."""
 
     name: AttemptName
-    goal: GraspGoal
-    outcome: AttemptOutcome
+    goal: records.GraspGoal
+    outcome: records.AttemptOutcome
     motion: AttemptMotion
     scenery: Scenery
     pictures: AttemptPictures = field(init=False)
@@ -106,7 +98,7 @@ class Demonstration:
         """Return the number of steps."""
         return len(self.motion)
 
-    def __iter__(self) -> Iterator[DemonstrationStep]:
+    def __iter__(self) -> Iterator[records.DemonstrationStep]:
         """Yield the steps."""
         return (self.step(k) for k in range(len(self)))
 
@@ -127,7 +119,7 @@ class Demonstration:
                     )
         return tuple(notes)
 
-    def step(self, k: int) -> DemonstrationStep:
+    def step(self, k: int) -> records.DemonstrationStep:
         """Return one step.
 
         Raises:
@@ -139,16 +131,16 @@ class Demonstration:
         after = min(k + 1, len(self) - 1)
         Ts_table_obj = {**scenery.Ts_table_obj, self.name.instance: m.Ts_table_obj[k]}
         T_base_table = se3.invert(scenery.T_table_base)
-        return DemonstrationStep(
+        return records.DemonstrationStep(
             index=k,
             time_s=float(m.time_s[k]),
-            phase=ALL_PHASES[m.phase[k]],
+            phase=records.ALL_PHASES[m.phase[k]],
             joints_rad=m.joints_rad[k],
             opening_m=float(m.opening_m[k]),
             held=bool(m.held[k]),
             T_base_ee=m.Ts_base_ee[k],
             Ts_base_obj={i: T_base_table @ T for i, T in Ts_table_obj.items()},
-            action=RobotAction(
+            action=records.RobotAction(
                 joints_rad=m.joints_rad[after],
                 opening_m=float(m.command_m[after]),
                 T_ee_next=se3.invert(m.Ts_base_ee[k]) @ m.Ts_base_ee[after],
@@ -165,9 +157,9 @@ class DemonstrationSource(Sequence[Demonstration]):
         self,
         grasps: SceneGrasps,
         models: Mapping[int, ObjectModel],
-        config: DemonstrationConfig | None = None,
+        config: records.DemonstrationConfig | None = None,
         *,
-        cameras: Sequence[DemonstrationCamera | FrontView] | None = None,
+        cameras: Sequence[records.DemonstrationCamera | FrontView] | None = None,
         solids: Mapping[int, KnownSolid] | None = None,
         cache: Path | None = None,
     ) -> None:
@@ -187,7 +179,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             InputError: there is no table or no attempt, an object has no model or pose, or the
                 sets do not say how they were made.
         """
-        self.config = config or DemonstrationConfig()
+        self.config = config or records.DemonstrationConfig()
         if not 1 <= self.config.rate_hz <= 240:
             raise InputError(
                 f"{self.config.rate_hz} steps per second cannot be; 1 to 240 is accepted."
@@ -231,7 +223,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             return [self._replayed(name) for name in self.attempts[index]]
         return self._replayed(self.attempts[index])
 
-    def stream(self, attempt: int) -> Iterator[DemonstrationStep]:
+    def stream(self, attempt: int) -> Iterator[records.DemonstrationStep]:
         """Yield the steps of an attempt; pictures are rendered as `look` is called.
 
         Raises:
@@ -258,13 +250,13 @@ class DemonstrationSource(Sequence[Demonstration]):
         there = ", ".join(f"{i} ({len(s)} grasps)" for i, s in self._sets.items())
         raise InputError(f"there is no grasp {grasp} of instance {instance}; there are: {there}.")
 
-    def goal(self, attempt: int) -> GraspGoal:
+    def goal(self, attempt: int) -> records.GraspGoal:
         """Return what an attempt is at, without replaying it."""
         name = self.attempts[attempt]
         s = self._sets[name.instance]
         T_table_grasp = self.scenery.Ts_table_obj[name.instance] @ s.Ts_obj_grasp[name.grasp]
         thing = self.scenery.models[name.instance].name
-        return GraspGoal(
+        return records.GraspGoal(
             obj_id=s.obj_id,
             instance=name.instance,
             name=thing,
@@ -301,7 +293,9 @@ class DemonstrationSource(Sequence[Demonstration]):
                     "scene since the school was run. Run `realsim school` again."
                 )
 
-    def _scenery(self, cameras: Sequence[DemonstrationCamera | FrontView] | None) -> Scenery:
+    def _scenery(
+        self, cameras: Sequence[records.DemonstrationCamera | FrontView] | None
+    ) -> Scenery:
         assert self._grasps.T_world_table is not None, "the constructor has looked"
         T_table_world = se3.invert(self._grasps.T_world_table)
         first = next(iter(self._sets.values()))
@@ -362,7 +356,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         return Demonstration(
             name=name,
             goal=self.goal(self.attempts.index(name)),
-            outcome=AttemptOutcome(
+            outcome=records.AttemptOutcome(
                 success=not s.failures[name.grasp],
                 stages_passed=round(STAGES_IN_ALL * float(s.base_scores[name.grasp])),
                 score=float(s.scores[name.grasp]),

@@ -17,19 +17,8 @@ import numpy as np
 
 from realsim.arrays import Array, Int64, Mask, Rows
 from realsim.errors import InputError
+from realsim.formats.graspnet import gripper_frame
 from realsim.formats.graspnet.grasp_labels import GraspLabels
-from realsim.formats.graspnet.gripper_frame import (
-    ANGLES,
-    BASE_M,
-    DEPTHS,
-    DEPTHS_M,
-    FINGER_M,
-    HEIGHT_M,
-    VIEWS,
-    angles_rad,
-    rotations,
-    views,
-)
 from realsim.geometry.mesh import sample_surface
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import RaySurface
@@ -186,10 +175,12 @@ def analytic_labels(
     """
     config = config or AnalyticConfig()
     points = spread_points(mesh, rng, config.points, config.voxel_m)
-    view_numbers = np.arange(0, VIEWS, config.view_step)
-    tried = np.zeros(VIEWS, dtype=np.bool_)
+    view_numbers = np.arange(0, gripper_frame.VIEWS, config.view_step)
+    tried = np.zeros(gripper_frame.VIEWS, dtype=np.bool_)
     tried[view_numbers] = True
-    R = rotations(-views()[view_numbers, None], angles_rad())  # (V, 12, 3, 3)
+    R = gripper_frame.rotations(
+        -gripper_frame.views()[view_numbers, None], gripper_frame.angles_rad()
+    )  # (V, 12, 3, 3)
 
     surface = RaySurface(mesh)
     found = [
@@ -200,13 +191,13 @@ def analytic_labels(
     friction: Array = np.concatenate([f[1] for f in found])
     openings: Array = np.concatenate([f[2] for f in found])
     collision = _in_object(mesh, points[index[:, 0]], R[index[:, 1], index[:, 2]],
-                           np.array(DEPTHS_M)[index[:, 3]], openings)  # fmt: skip
+                           np.array(gripper_frame.DEPTHS_M)[index[:, 3]], openings)  # fmt: skip
     index[:, 1] = view_numbers[index[:, 1]]
     return GraspLabels(
         points=points,
         index=index.astype(np.int32),
-        angles_rad=angles_rad()[index[:, 2]].astype(np.float32),
-        depths_m=np.array(DEPTHS_M, dtype=np.float32)[index[:, 3]],
+        angles_rad=gripper_frame.angles_rad()[index[:, 2]].astype(np.float32),
+        depths_m=np.array(gripper_frame.DEPTHS_M, dtype=np.float32)[index[:, 3]],
         openings_m=openings.astype(np.float32),
         friction=friction.astype(np.float32),
         collision=collision,
@@ -241,9 +232,9 @@ def _closing(
 
     The view in the index is the row of `R` (V, 12, 3, 3).
     """
-    shape = (len(points), len(R), ANGLES, DEPTHS)
+    shape = (len(points), len(R), gripper_frame.ANGLES, gripper_frame.DEPTHS)
     x, y = R[:, :, None, :, 0], R[:, :, None, :, 1]
-    middles = points[:, None, None, None] + np.array(DEPTHS_M)[:, None] * x
+    middles = points[:, None, None, None] + np.array(gripper_frame.DEPTHS_M)[:, None] * x
     middles = np.broadcast_to(middles, (*shape, 3)).reshape(-1, 3)
     closing = np.broadcast_to(y, (*shape, 3)).reshape(-1, 3)
     limit = max(config.levels) + ROUNDING
@@ -301,10 +292,13 @@ def gripper_boxes(depths_m: Array, openings_m: Array) -> Array:
     """
     boxes = np.empty((len(depths_m), 3, 2, 3))
     inner = 0.5 * openings_m
-    outer = inner + FINGER_M
-    boxes[..., 0, 2], boxes[..., 1, 2] = -0.5 * HEIGHT_M, 0.5 * HEIGHT_M
-    boxes[:, 0, 0, 0], boxes[:, 0, 1, 0] = -(BASE_M + FINGER_M), -BASE_M
-    boxes[:, 1:, 0, 0], boxes[:, 1:, 1, 0] = -BASE_M, depths_m[:, None]
+    outer = inner + gripper_frame.FINGER_M
+    boxes[..., 0, 2], boxes[..., 1, 2] = -0.5 * gripper_frame.HEIGHT_M, 0.5 * gripper_frame.HEIGHT_M
+    boxes[:, 0, 0, 0], boxes[:, 0, 1, 0] = (
+        -(gripper_frame.BASE_M + gripper_frame.FINGER_M),
+        -gripper_frame.BASE_M,
+    )
+    boxes[:, 1:, 0, 0], boxes[:, 1:, 1, 0] = -gripper_frame.BASE_M, depths_m[:, None]
     boxes[:, 0, 0, 1], boxes[:, 0, 1, 1] = -outer, outer
     boxes[:, 1, 0, 1], boxes[:, 1, 1, 1] = -outer, -inner
     boxes[:, 2, 0, 1], boxes[:, 2, 1, 1] = inner, outer

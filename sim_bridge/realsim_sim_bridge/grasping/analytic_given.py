@@ -14,16 +14,8 @@ from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.robots.hand import Hand
+from realsim_sim_bridge.grasping import candidates
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
-from realsim_sim_bridge.grasping.candidates import (
-    FREE,
-    IN_NEIGHBOUR,
-    IN_OBJECT,
-    IN_TABLE,
-    Candidates,
-    HandPoses,
-    Stand,
-)
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 from realsim_sim_bridge.grasping.surroundings import Surroundings
 
@@ -40,7 +32,7 @@ def given_candidates(
     geometry: Hand,
     *,
     centred: bool = True,
-) -> tuple[Candidates, Rows]:
+) -> tuple[candidates.Candidates, Rows]:
     """Return those of given grasps that the hand can take where the object stands, and their rows.
 
     Args:
@@ -80,25 +72,25 @@ def given_candidates(
     near, wide = touched & (widths < config.least_width_m), touched & (needed > most)
     wide &= ~near
     rows = np.flatnonzero(touched & ~near & ~wide)
-    poses = HandPoses(
+    poses = candidates.HandPoses(
         Ts_obj_grasp=Ts[rows], widths_m=needed[rows], openings_m=open_hand[rows],
         contact_depths_m=np.zeros(len(rows)),
     )  # fmt: skip
-    stand = Stand(surface, T_table_obj, surroundings.tree()[0], config, geometry)
+    stand = candidates.Stand(surface, T_table_obj, surroundings.tree()[0], config, geometry)
     placed, reached = stand.placed(poses)
-    free = reached == FREE
+    free = reached == candidates.FREE
     counts = {
         "given": len(Ts),
         "without_contacts": int(np.sum(~touched)),
         "too_near": int(np.sum(near)),
         "too_wide": int(np.sum(wide)),
-        "hand_in_table": int(np.sum(reached == IN_TABLE)),
-        "hand_in_object": int(np.sum(reached == IN_OBJECT)),
-        "hand_in_neighbour": int(np.sum(reached == IN_NEIGHBOUR)),
+        "hand_in_table": int(np.sum(reached == candidates.IN_TABLE)),
+        "hand_in_object": int(np.sum(reached == candidates.IN_OBJECT)),
+        "hand_in_neighbour": int(np.sum(reached == candidates.IN_NEIGHBOUR)),
         "free": int(np.sum(free)),
         "kept": int(np.sum(free)),
     }
-    found = Candidates(
+    found = candidates.Candidates(
         Ts_obj_grasp=placed.Ts_obj_grasp[free],
         widths_m=widths[rows][free],
         openings_m=placed.openings_m[free],

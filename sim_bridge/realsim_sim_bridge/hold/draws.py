@@ -26,14 +26,10 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, Mesh
 from realsim.robots.hand import Hand, along_approach
+from realsim_sim_bridge.grasping import surroundings
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.limit_analysis import PadPatches, pad_patches, safety_factors
 from realsim_sim_bridge.grasping.pad_contacts import pad_heights
-from realsim_sim_bridge.grasping.surroundings import (
-    SurfaceTree,
-    first_triangle_inside,
-    surface_tree,
-)
 from realsim_sim_bridge.slip.motion import Loads, stage_loads
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
 
@@ -185,12 +181,12 @@ class GraspedObject:
     """An object's surface, ready for rays and for hands that touch it."""
 
     rays: RaySurface
-    tree: SurfaceTree | None
+    tree: surroundings.SurfaceTree | None
 
     @classmethod
     def of(cls, mesh: Mesh) -> "GraspedObject":
         """Return the surface of a mesh."""
-        return cls(rays=RaySurface(mesh), tree=surface_tree(mesh.vertices[mesh.faces]))
+        return cls(rays=RaySurface(mesh), tree=surroundings.surface_tree(mesh.vertices[mesh.faces]))
 
     def stopped(self, Ts_obj_grasp: Array, hand: Hand, most_m: float) -> tuple[Array, Mask]:
         """Return where hands (N, 4, 4) stop that would reach into the object with the palm.
@@ -207,7 +203,7 @@ class GraspedObject:
         back = np.zeros(len(Ts_obj_grasp))
         Ts = Ts_obj_grasp
         for _ in range(MOST_STEPS_BACK):
-            inside = first_triangle_inside(palms, Ts, self.tree, -most_m) >= 0
+            inside = surroundings.first_triangle_inside(palms, Ts, self.tree, -most_m) >= 0
             if not inside.any():
                 break
             back[inside] += STEP_BACK_M
@@ -274,7 +270,7 @@ def draw_holds(
     draws: list[tuple[Array | Mask, ...]] = []
     for k in range(count):
         Ts, touched = obj.stopped(Ts_moved[k], hand, PALM_M)
-        blocked = first_triangle_inside(fingers, Ts, obj.tree, -config.touch_m) >= 0
+        blocked = surroundings.first_triangle_inside(fingers, Ts, obj.tree, -config.touch_m) >= 0
         pads = _pads(obj, trial, Ts, hand)
         patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
         # The last load is none: it is borne wherever the squeeze is balanced.

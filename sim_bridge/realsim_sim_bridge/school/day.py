@@ -13,13 +13,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
 from realsim.many import Outcome, Pool, Sent, Task, WorkerDiedError, run_many
 from realsim.models.convex import convex_parts
-from realsim_sim_bridge.school.kept_sets import (
-    SchoolResult,
-    read_prepared,
-    read_result,
-    write_prepared,
-    write_result,
-)
+from realsim_sim_bridge.school import kept_sets
 from realsim_sim_bridge.school.object_slips import in_words, result_of, stand_of
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, prepare, trial_of, untried
 from realsim_sim_bridge.school.shards import Tested, read_tested, run_shard, shards_of, write_tested
@@ -36,7 +30,7 @@ class Pupil:
     folder: Path | None
     """Where its files are kept; None = nowhere."""
     shard_grasps: int
-    result: SchoolResult | None = None
+    result: kept_sets.SchoolResult | None = None
     prepared: Prepared | None = None
     shards: list[Rows] = field(default_factory=list[Rows])
     tested: list[Tested] = field(default_factory=list[Tested])
@@ -48,10 +42,10 @@ class Pupil:
     def __post_init__(self) -> None:
         """Take from the folder whatever has been done before."""
         path = self.path("grasps")
-        self.result = None if path is None else read_result(path)
+        self.result = None if path is None else kept_sets.read_result(path)
         path = self.path("prepared")
         if self.result is None and path is not None:
-            prepared = read_prepared(path)
+            prepared = kept_sets.read_prepared(path)
             if prepared is not None:
                 self._divide(prepared)
 
@@ -96,7 +90,7 @@ class Pupil:
         """Keep the preparation and divide the grasps into shards."""
         path = self.path("prepared")
         if path is not None and keep:
-            write_prepared(path, prepared)
+            kept_sets.write_prepared(path, prepared)
         self._divide(prepared)
 
     def _divide(self, prepared: Prepared) -> None:
@@ -167,7 +161,7 @@ class Pupil:
         path = self.path("grasps")
         if path is None or self.given_up:
             return
-        write_result(path, self.result)
+        kept_sets.write_result(path, self.result)
         for piece in [self.path("prepared"), *(self._shard_path(rows) for rows in self.shards)]:
             if piece is not None:
                 piece.unlink(missing_ok=True)

@@ -17,17 +17,8 @@ from realsim.pages.plots import png
 from realsim.records import GraspSet, ObjectModel
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import score_hex, score_rgb
+from realsim_sim_bridge.school import sheet_object
 from realsim_sim_bridge.school.measure_statistics import LABEL_BINS, joined, label_chart, mean_label
-from realsim_sim_bridge.school.sheet_object import (
-    STOPS,
-    Box,
-    axes_at,
-    draw_object,
-    ink_on,
-    names_of_sets,
-    stops_of,
-    text_at,
-)
 
 WIDTH_PX = 1600
 DPI = 100
@@ -91,7 +82,7 @@ def sheet_figure(
     _title(figure, sets, title)
     _charts(figure, sets)
     _legend(figure, TITLE_PX + CHARTS_PX, sets)
-    names = names_of_sets(sets, {i: m.name for i, m in models.items()})
+    names = sheet_object.names_of_sets(sets, {i: m.name for i, m in models.items()})
     width = (WIDTH_PX - 2 * MARGIN_PX) / columns
     for k, (s, name) in enumerate(zip(sets, names, strict=True)):
         row, column = divmod(k, columns)
@@ -99,7 +90,7 @@ def sheet_figure(
             MARGIN_PX + column * width + 8, top + row * OBJECT_PX, width - 16, OBJECT_PX - 22,
         )  # fmt: skip
         T_up_obj = Ts_up_obj.get(s.instance, np.eye(4))
-        draw_object(figure, box, s, models[s.obj_id].mesh, name, T_up_obj)
+        sheet_object.draw_object(figure, box, s, models[s.obj_id].mesh, name, T_up_obj)
     return figure
 
 
@@ -119,14 +110,14 @@ def _require_models(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel])
 
 def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
     """Write the title and the figures of the scene."""
-    text_at(figure, MARGIN_PX, 34, title[:70], 19, INK, bold=True)
+    sheet_object.text_at(figure, MARGIN_PX, 34, title[:70], 19, INK, bold=True)
     scores = joined([s.scores for s in sets])
     known = scores[~np.isnan(scores)]
     plural = "" if len(sets) == 1 else "s"
     said = f"{len(sets)} object{plural}, {len(scores):,} candidates"
     if len(known):
         said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean {mean_label(sets)}"
-    text_at(figure, WIDTH_PX - MARGIN_PX, 34, said, 13, MUTED, align="right")
+    sheet_object.text_at(figure, WIDTH_PX - MARGIN_PX, 34, said, 13, MUTED, align="right")
 
 
 def _charts(figure: Any, sets: Sequence[GraspSet]) -> None:
@@ -143,8 +134,8 @@ def _charts(figure: Any, sets: Sequence[GraspSet]) -> None:
         chart(_chart_axes(figure, (left, TITLE_PX + 34, right - left, CHARTS_PX - 96)), sets)
 
 
-def _chart_axes(figure: Any, box: Box) -> Any:
-    ax = axes_at(figure, box)
+def _chart_axes(figure: Any, box: sheet_object.Box) -> Any:
+    ax = sheet_object.axes_at(figure, box)
     ax.set_facecolor(PAPER)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
@@ -163,8 +154,10 @@ def _named(ax: Any, title: str, below: str, beside: str = "") -> None:
 
 def left_after(sets: Sequence[GraspSet]) -> Int64:
     """Return how many candidates are left: all, with a trajectory, and after each stage."""
-    stops = joined([stops_of(s) for s in sets])
-    return np.array([len(stops), *(int(np.sum(stops > k)) for k in range(1, len(STOPS) - 1))])
+    stops = joined([sheet_object.stops_of(s) for s in sets])
+    return np.array(
+        [len(stops), *(int(np.sum(stops > k)) for k in range(1, len(sheet_object.STOPS) - 1))]
+    )
 
 
 def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
@@ -173,18 +166,18 @@ def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
     lost = -np.diff(counts, prepend=counts[0])
     places = np.arange(len(counts))[::-1]
     ax.barh(places, counts, height=0.72, color=BAR_COLOR)
-    untried = int(np.sum(joined([stops_of(s) for s in sets]) == 0))
+    untried = int(np.sum(joined([sheet_object.stops_of(s) for s in sets]) == 0))
     taken = [0, lost[1] - untried, *lost[2:]]
-    colors = [color for _, color in STOPS[:-1]]
+    colors = [color for _, color in sheet_object.STOPS[:-1]]
     ax.barh(places, taken, left=counts, height=0.72, color=colors)
     ax.barh(places[1], untried, left=counts[0] - untried, height=0.72, color=colors[0])
     most = max(1, counts[0])
     for place, count, loss, color in zip(places, counts, taken, colors, strict=True):
         said = f"{count:,}  ({100 * count / most:.0f} %)"
         # In the bar, in what the stage took, or beside both: wherever there is room.
-        at, align, ink = count, "right", ink_on(BAR_COLOR)
+        at, align, ink = count, "right", sheet_object.ink_on(BAR_COLOR)
         if count < ROOM * most:
-            at, ink = count + loss, ink_on(color)
+            at, ink = count + loss, sheet_object.ink_on(color)
             if loss < ROOM * most:
                 align, ink = "left", INK
         pad = PAD * most if align == "left" else -PAD * most
@@ -222,10 +215,10 @@ def _ten_bars(ax: Any, counts: Int64, colors: str | list[str], title: str, name:
 def _legend(figure: Any, top: float, sets: Sequence[GraspSet]) -> None:
     """Explain the colours of the bars and of the hands, in one line."""
     width = WIDTH_PX - 2 * MARGIN_PX
-    ax = axes_at(figure, (MARGIN_PX, top, width, LEGEND_PX))
+    ax = sheet_object.axes_at(figure, (MARGIN_PX, top, width, LEGEND_PX))
     middle = LEGEND_PX / 2 + 2
     at = _written(ax, 12.0, middle, "stopped at:", MUTED) + 14
-    for label, color in STOPS:
+    for label, color in sheet_object.STOPS:
         ax.add_patch(_swatch(at, middle, color))
         at = _written(ax, at + 20, middle, label, INK) + 18
     # From the right the hands, whose colours run with the label.

@@ -25,15 +25,7 @@ from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import check_values, executed
 from realsim.json_values import json_value
 from realsim.records import STAGES, GraspSet
-from realsim_sim_bridge.school.measure_statistics import (
-    ClosureConfusion,
-    PHoldSpread,
-    RankCorrelation,
-    closure_confusions,
-    joined,
-    p_hold_spread,
-    rank_correlations,
-)
+from realsim_sim_bridge.school import measure_statistics
 from realsim_sim_bridge.slip.score import judged, score_paper
 
 # --- The summary as the paper prints it, beside the paper's own figures --------------------------
@@ -222,9 +214,9 @@ class SchoolSummary:
     """Numbers of candidates, good and bad ones: of an object over all scenes, and of a scene."""
     hands: tuple["HandResult", ...] = ()
     """Where grasps of several hands are summed up: each hand on the objects that all have tried."""
-    correlations: tuple[RankCorrelation, ...] = ()
-    closures: tuple[ClosureConfusion, ...] = ()
-    p_hold: PHoldSpread | None = None
+    correlations: tuple[measure_statistics.RankCorrelation, ...] = ()
+    closures: tuple[measure_statistics.ClosureConfusion, ...] = ()
+    p_hold: measure_statistics.PHoldSpread | None = None
     """None = no set has one."""
     by_paper: "SchoolSummary | None" = None
     """The same by `score_paper` in place of the nominal score; None = this is it."""
@@ -295,9 +287,9 @@ def summarise(
     nominal = _counted_up(by_scene)
     return replace(
         nominal,
-        correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
-        closures=tuple(closure_confusions(sets)),
-        p_hold=p_hold_spread(sets),
+        correlations=measure_statistics.rank_correlations(sets, rng or np.random.default_rng(0)),
+        closures=tuple(measure_statistics.closure_confusions(sets)),
+        p_hold=measure_statistics.p_hold_spread(sets),
         by_paper=_counted_up({name: [_by_paper(s) for s in of] for name, of in by_scene.items()}),
     )
 
@@ -312,13 +304,15 @@ def _counted_up(by_scene: Mapping[str, Sequence[GraspSet]]) -> SchoolSummary:
     """Return what became of the candidates by the sets' scores."""
     sets = [s for part in by_scene.values() for s in part]
     outcome = [outcomes_of(s) for s in sets]
-    scores = joined([s.scores for s in sets])
+    scores = measure_statistics.joined([s.scores for s in sets])
     scored = scores[~np.isnan(scores)]
     is_good = scored >= GOOD_FROM
     by_object: dict[tuple[str, ...], list[GraspSet]] = {}
     for s in sets:
         by_object.setdefault(_identity(s), []).append(s)
-    counts = np.bincount(joined(outcome).astype(np.int64), minlength=len(OUTCOMES))
+    counts = np.bincount(
+        measure_statistics.joined(outcome).astype(np.int64), minlength=len(OUTCOMES)
+    )
     return SchoolSummary(
         scenes=len(by_scene),
         objects=len(by_object),
@@ -354,9 +348,9 @@ def _hands_on_same_objects(
     shared = [sets for sets in by_object.values() if {s.hand[0] for s in sets} == set(names)]
     for name in names:
         mine = [s for sets in shared for s in sets if s.hand[0] == name]
-        scores = joined([s.scores for s in mine])
+        scores = measure_statistics.joined([s.scores for s in mine])
         known = ~np.isnan(scores)
-        reached = joined([s.reachable for s in mine])[known]
+        reached = measure_statistics.joined([s.reachable for s in mine])[known]
         scores = scores[known]
         yield HandResult(
             hand=name, objects=len(shared), judged=len(scores), reached=int(reached.sum()),

@@ -27,13 +27,7 @@ from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.bullet_shapes import (
-    drawn_in,
-    hand_urdf,
-    massless_link,
-    shape_in,
-    wavefront,
-)
+from realsim_sim_bridge.slip import bullet_shapes
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 
@@ -97,11 +91,11 @@ class BulletPair:
             self.hand = self._add_hand(Path(folder), geometry)
             T_body_obj = se3.invert(self._T_obj_body)
             parts = [se3.transform(T_body_obj, part) for part in body.parts]
-            cores, margin = drawn_in(parts, settings.collision_margin_m)
+            cores, margin = bullet_shapes.drawn_in(parts, settings.collision_margin_m)
             shape = self._shape(cores, Path(folder) / "object.obj")
             whole = None
             if stand is not None and len(parts) > 1:
-                hull, hull_margin = drawn_in([np.concatenate(parts)], LINK_MARGIN_M)
+                hull, hull_margin = bullet_shapes.drawn_in([np.concatenate(parts)], LINK_MARGIN_M)
                 if hull_margin == LINK_MARGIN_M:  # what is thinner stands on its parts
                     whole = self._shape(hull, Path(folder) / "hull.obj")
             self.object = self._add_object(shape, margin, whole)
@@ -118,7 +112,7 @@ class BulletPair:
         """Load the hand; its fingers stand still until they are driven."""
         engine, settings = self.engine, self._settings
         urdf = folder / "hand.urdf"
-        urdf.write_text(hand_urdf(geometry, self._physics.pads))
+        urdf.write_text(bullet_shapes.hand_urdf(geometry, self._physics.pads))
         hand: int = engine.loadURDF(
             str(urdf),
             [0.0, 0.0, 0.0],
@@ -151,8 +145,8 @@ class BulletPair:
 
     def _shape(self, parts: list[Array], path: Path) -> int:
         """Return the collision shape of convex parts (V, 3), body frame, through a file."""
-        path.write_text(wavefront(parts))
-        return shape_in(self.engine, path, len(parts))
+        path.write_text(bullet_shapes.wavefront(parts))
+        return bullet_shapes.shape_in(self.engine, path, len(parts))
 
     def _add_object(self, shape: int, margin_m: float, whole: int | None) -> int:
         """Add the object; its frame in the engine is the principal one.
@@ -164,7 +158,7 @@ class BulletPair:
                 points at most, where every part would touch in four.
         """
         engine = self.engine
-        link = {} if whole is None else massless_link(whole, engine.JOINT_FIXED)
+        link = {} if whole is None else bullet_shapes.massless_link(whole, engine.JOINT_FIXED)
         obj: int = engine.createMultiBody(
             baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY, **link
         )
@@ -194,7 +188,9 @@ class BulletPair:
         half = [size / 2.0 for size in TABLE_M]
         wanted = [(engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half), rough)]
         if stand.obstacles:
-            cores, margin = drawn_in(list(stand.obstacles), settings.collision_margin_m)
+            cores, margin = bullet_shapes.drawn_in(
+                list(stand.obstacles), settings.collision_margin_m
+            )
             beside = self._shape(cores, folder / "beside.obj")
             wanted.append((beside, rough | {"collisionMargin": margin}))
         found: list[int] = []

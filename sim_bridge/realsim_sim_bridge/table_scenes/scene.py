@@ -22,15 +22,9 @@ from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import atomic
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
+from realsim_sim_bridge.table_scenes import sample
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
 from realsim_sim_bridge.table_scenes.pool import ObjectPool, read_object
-from realsim_sim_bridge.table_scenes.sample import (
-    Layout,
-    generator,
-    layout_to_json,
-    scene_table,
-    sized,
-)
 from realsim_sim_bridge.table_scenes.tables import TableModel, TablePart, floor, walls
 
 # --- How a scene looks: materials and light, made by formulas or of the user's own images --------
@@ -179,7 +173,7 @@ def scene_name(number: int) -> str:
 
 
 def build_scene(
-    layout: Layout,
+    layout: sample.Layout,
     pool: ObjectPool,
     config: TableSceneConfig,
     *,
@@ -201,12 +195,12 @@ def build_scene(
         InputError: a mesh that was there when the scene was laid out cannot be read.
     """
     own = own or OwnLooks()
-    table, rng = scene_table(layout.seed, layout.number, config)
+    table, rng = sample.scene_table(layout.seed, layout.number, config)
     models: dict[int, ObjectModel] = {}
     solids: dict[int, KnownSolid] = {}
     materials: dict[int, Material] = {}
     poses: list[ObjectPose] = []
-    looks = generator(layout.seed, layout.number, "looks")
+    looks = sample.generator(layout.seed, layout.number, "looks")
     environment = draw_environment(looks, own)
     room: tuple[TablePart, ...] = (floor(table.height_m),)
     # A wall in the sun's way would leave the picture dark: its exposure is that of open air.
@@ -219,7 +213,7 @@ def build_scene(
         keep = config.pool.keep_size
         density = found.density if keep and found.density else config.density
         obj_id = instance + 1
-        model, solid = sized(found, laid.scale, obj_id, density, centred=not keep)
+        model, solid = sample.sized(found, laid.scale, obj_id, density, centred=not keep)
         models[obj_id] = replace(model, name=names[instance])
         solids[obj_id] = solid
         material = object_look(looks, own)
@@ -256,13 +250,13 @@ def _unique(names: list[str]) -> Iterator[str]:
         yield free
 
 
-def _provenance(layout: Layout, pool: ObjectPool) -> dict[str, Any]:
+def _provenance(layout: sample.Layout, pool: ObjectPool) -> dict[str, Any]:
     return {
         "made_by": "realsim generate",
         "version": __version__,
         "poses": "simulated: dropped in PyBullet until rest",
         "pool": [s.label for s in pool.sources],
-        "layout": layout_to_json(layout),
+        "layout": sample.layout_to_json(layout),
     }
 
 
