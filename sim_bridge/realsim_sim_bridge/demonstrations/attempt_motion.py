@@ -31,11 +31,10 @@ import numpy as np
 from realsim import interop
 from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
-from realsim.models.convex import collision_obj
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in_shape
 from realsim_sim_bridge.slip.world import SlipBody
 
 RATE_HZ = 960.0
@@ -65,11 +64,7 @@ def fall(
             [m].
         times_s: (S,) since it was lost, not decreasing [s].
     """
-    with interop.quiet_output():
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
-
-        engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+    engine = interop.pybullet_client()
     try:
         with tempfile.TemporaryDirectory(prefix="realsim_fall_") as folder:
             number = _build(engine, Path(folder), body, T_table_obj, twist, others)
@@ -96,12 +91,12 @@ def _build(
     table = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[half, half, 0.25])
     statics = [engine.createMultiBody(0.0, table, -1, [0.0, 0.0, -0.25])]
     for k, corners in enumerate(others):
-        shape, margin = _shape(engine, folder / f"other{k}.obj", [corners])
+        shape, margin = drawn_in_shape(engine, folder / f"other{k}.obj", [corners], MARGIN_M)
         statics.append(engine.createMultiBody(0.0, shape))
         engine.changeDynamics(statics[-1], -1, collisionMargin=margin)
     T_obj_body, moments = body.principal_frame()
     parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
-    shape, margin = _shape(engine, folder / "object.obj", parts)
+    shape, margin = drawn_in_shape(engine, folder / "object.obj", parts, MARGIN_M)
     position, xyzw = interop.pybullet_from_T(T_table_obj @ T_obj_body)
     number: int = engine.createMultiBody(body.mass_kg, shape, -1, position, xyzw)
     # Damping never in one call with friction: PyBullet then drops the friction.
@@ -112,14 +107,6 @@ def _build(
         engine.changeDynamics(each, -1, lateralFriction=float(np.sqrt(FRICTION)))
     engine.resetBaseVelocity(number, twist[3:].tolist(), twist[:3].tolist())
     return number
-
-
-def _shape(engine: Any, path: Path, parts: Sequence[Array]) -> tuple[int, float]:
-    """Return a collision shape of convex parts and the margin that makes it as large."""
-    cores, margin = drawn_in(list(parts), MARGIN_M)
-    path.write_bytes(collision_obj(cores))
-    shape: int = engine.createCollisionShape(engine.GEOM_MESH, fileName=str(path))
-    return shape, margin
 
 
 def _poses(engine: Any, number: int, T_body_obj: Array, times_s: Array) -> Array:

@@ -14,13 +14,13 @@ import numpy as np
 
 from realsim import interop
 from realsim.arrays import Array
-from realsim.errors import InputError, RealsimError
+from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
+from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectPose
 from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in, shape_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in_shape, require_taken, settings_in
 from realsim_sim_bridge.slip.world import SlipBody
 
 # --- Settings under which a box on a table rests; each is read back from the engine --------------
@@ -50,15 +50,6 @@ larger: they meet too early."""
 
 
 TABLE = "the table"
-_INFO = {
-    "mass": 0,
-    "lateralFriction": 1,
-    "restitution": 5,
-    "rollingFriction": 6,
-    "spinningFriction": 7,
-    "collisionMargin": 11,
-}
-"""Where getDynamicsInfo has each setting; the inertia, a list, is at 2."""
 
 
 class TableWorld:
@@ -126,8 +117,7 @@ class TableWorld:
         )
         self._engine.setGravity(0.0, 0.0, -GRAVITY)
         found = self._engine.getPhysicsEngineParameters()
-        for name, value in wanted.items():
-            _require_taken(name, float(found[name]), value, "the engine")
+        require_taken(found, wanted, "the engine")
 
     def _add_table(self) -> None:
         T = self.scene.T_table_world
@@ -164,8 +154,8 @@ class TableWorld:
                 raise InputError(f"the support '{support.name}' is no solid: {error}") from error
             if not THIN_RATIO <= parts.volume_ratio <= FAT_RATIO:
                 self.notes.append(_blown_up(f"the support '{support.name}'", parts.volume_ratio))
-            cores, margin = drawn_in(list(parts.parts), COLLISION_MARGIN_M)
-            shape = self._shape(cores, folder / f"support{len(self.statics)}.obj")
+            path = folder / f"support{len(self.statics)}.obj"
+            shape, margin = drawn_in_shape(self._engine, path, parts.parts, COLLISION_MARGIN_M)
             body = self._engine.createMultiBody(0.0, shape, -1, position, xyzw)
             self._engine.changeDynamics(body, -1, collisionMargin=margin)
         self._add_static(body, support.name)
@@ -174,7 +164,7 @@ class TableWorld:
         wanted = self._contact()
         for link in range(-1, self._engine.getNumJoints(body)):
             self._engine.changeDynamics(body, link, **wanted)
-            self._check(body, link, wanted, name)
+            require_taken(settings_in(self._engine, body, link), wanted, name)
         self.statics.append(body)
         self.names[body] = name
 
@@ -183,8 +173,8 @@ class TableWorld:
         T_obj_body, moments = slip_body.principal_frame()
         T_body_obj = se3.invert(T_obj_body)
         parts = [se3.transform(T_body_obj, part) for part in slip_body.parts]
-        cores, margin = drawn_in(parts, COLLISION_MARGIN_M)
-        shape = self._shape(cores, folder / f"object{o.instance}.obj")
+        path = folder / f"object{o.instance}.obj"
+        shape, margin = drawn_in_shape(self._engine, path, parts, COLLISION_MARGIN_M)
         T = self.scene.T_table_world @ o.T_world_obj @ T_obj_body
         position, xyzw = interop.pybullet_from_T(T)
         mass = slip_body.mass_kg
@@ -193,10 +183,10 @@ class TableWorld:
         self._engine.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
         wanted = self._contact() | {"mass": mass, "collisionMargin": margin}
         self._engine.changeDynamics(body, -1, localInertiaDiagonal=moments.tolist(), **wanted)
-        self._check(body, -1, wanted, name)
-        found = self._engine.getDynamicsInfo(body, -1)[2]
-        for i in range(3):
-            _require_taken(f"inertia {i}", float(found[i]), float(moments[i]), name)
+        held = self._engine.getDynamicsInfo(body, -1)[2]
+        found = settings_in(self._engine, body) | {f"inertia {i}": held[i] for i in range(3)}
+        wanted |= {f"inertia {i}": float(moments[i]) for i in range(3)}
+        require_taken(found, wanted, name)
         self.bodies[o.instance] = body
         self.names[body] = name
         self._Ts_obj_body[o.instance] = T_obj_body
@@ -208,15 +198,6 @@ class TableWorld:
             "rollingFriction": 0.0,
             "spinningFriction": 0.0,
         }
-
-    def _shape(self, parts: list[Array], path: Path) -> int:
-        path.write_bytes(collision_obj(parts))
-        return shape_in(self._engine, path, len(parts))
-
-    def _check(self, body: int, link: int, wanted: dict[str, float], name: str) -> None:
-        info = self._engine.getDynamicsInfo(body, link)
-        for key, value in wanted.items():
-            _require_taken(key, float(info[_INFO[key]]), value, name)
 
     # --- what happens in it -------------------------------------------------------------------
 
@@ -247,23 +228,14 @@ class TableWorld:
     def settings(self) -> dict[str, float]:
         """Return the engine's own settings, read back, and the first object's."""
         found = self._engine.getPhysicsEngineParameters()
-        info = self._engine.getDynamicsInfo(next(iter(self.bodies.values())), -1)
+        held = settings_in(self._engine, next(iter(self.bodies.values())))
         return {
             "dt_s": float(found["fixedTimeStep"]),
             "iterations": float(found["numSolverIterations"]),
             "gravity": -float(found["gravityAccelerationZ"]),
-            "contact_friction": float(info[1]) ** 2,
-            "collision_margin_m": float(info[_INFO["collisionMargin"]]),
+            "contact_friction": held["lateralFriction"] ** 2,
+            "collision_margin_m": held["collisionMargin"],
         }
-
-
-def _require_taken(name: str, found: float, wanted: float, of: str) -> None:
-    """Raise if the engine holds another value than it was given."""
-    if abs(found - wanted) > 1e-9 * max(1.0, abs(wanted)):
-        raise RealsimError(
-            f"PyBullet holds {name} = {found:g} for {of} instead of {wanted:g}; its results would "
-            "be wrong."
-        )
 
 
 def _of_solids(scene: SchoolScene) -> Iterator[str]:

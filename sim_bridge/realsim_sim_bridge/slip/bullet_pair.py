@@ -24,7 +24,6 @@ import numpy as np
 
 from realsim import interop
 from realsim.arrays import Array
-from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip import bullet_shapes
@@ -209,14 +208,8 @@ class BulletPair:
 
     def _check(self, body: int, link: int, wanted: dict[str, float]) -> None:
         """Raise if the engine did not take a setting."""
-        info = self.engine.getDynamicsInfo(body, link)
-        for name, value in wanted.items():
-            found = float(info[_INFO[name]])
-            if abs(found - value) > 1e-9 * max(1.0, abs(value)):
-                raise RealsimError(
-                    f"PyBullet holds {name} = {found} for link {link} instead of {value}; its "
-                    "results would be wrong. Was changeDynamics called with damping on a link?"
-                )
+        found = bullet_shapes.settings_in(self.engine, body, link)
+        bullet_shapes.require_taken(found, wanted, f"link {link}")
 
     # --- what happens in it -------------------------------------------------------------------
 
@@ -334,16 +327,17 @@ class BulletPair:
         """Return what the engine says its settings are."""
         engine = self.engine
         points = len(self._physics.pads.centers_xz()) if self._physics.pads else 0
-        finger = engine.getDynamicsInfo(self.hand, self._fingers[0])
-        held = engine.getDynamicsInfo(self.object, -1)
+        finger = bullet_shapes.settings_in(engine, self.hand, self._fingers[0])
+        held = bullet_shapes.settings_in(engine, self.object)
+        moments = engine.getDynamicsInfo(self.object, -1)[2]
         parameters = engine.getPhysicsEngineParameters()
         return {
-            "finger_friction": float(finger[_INFO["lateralFriction"]]),
-            "object_friction": float(held[_INFO["lateralFriction"]]),
-            "pad_stiffness_n_per_m": points * float(finger[_INFO["contactStiffness"]]),
-            "contact_damping": float(finger[_INFO["contactDamping"]]),
-            "object_mass_kg": float(held[0]),
-            "object_inertia_least": float(min(held[2])),
+            "finger_friction": finger["lateralFriction"],
+            "object_friction": held["lateralFriction"],
+            "pad_stiffness_n_per_m": points * finger["contactStiffness"],
+            "contact_damping": finger["contactDamping"],
+            "object_mass_kg": held["mass"],
+            "object_inertia_least": float(min(moments)),
             "dt_s": float(parameters["fixedTimeStep"]),
             "iterations": float(parameters["numSolverIterations"]),
             "substeps": float(parameters["numSubSteps"]),
@@ -371,14 +365,3 @@ def _disconnect(engine: Any) -> None:
     """Free an engine's memory."""
     if engine.isConnected():
         engine.disconnect()
-
-
-_INFO = {
-    "lateralFriction": 1,
-    "rollingFriction": 6,
-    "spinningFriction": 7,
-    "contactDamping": 8,
-    "contactStiffness": 9,
-    "collisionMargin": 11,
-}
-"""Where getDynamicsInfo has each setting."""

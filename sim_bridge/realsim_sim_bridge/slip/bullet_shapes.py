@@ -1,5 +1,6 @@
-"""The hand and convex parts as PyBullet takes them."""
+"""The hand and convex parts as PyBullet takes them, and whether it took what it was given."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import RealsimError
+from realsim.models.convex import collision_obj
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.world import PadModel
 
@@ -183,6 +185,15 @@ def shape_in(engine: Any, path: Path, parts: int) -> int:
     return shape
 
 
+def drawn_in_shape(
+    engine: Any, path: Path, parts: Sequence[Array], margin_m: float
+) -> tuple[int, float]:
+    """Return a collision shape of convex parts, through a file, and its margin (`drawn_in`)."""
+    cores, margin = drawn_in(list(parts), margin_m)
+    path.write_bytes(collision_obj(cores))
+    return shape_in(engine, path, len(cores)), margin
+
+
 def massless_link(shape: int, fixed: int) -> dict[str, list[Any]]:
     """Return what `createMultiBody` takes for a link of a shape in the base's frame.
 
@@ -203,3 +214,36 @@ def massless_link(shape: int, fixed: int) -> dict[str, list[Any]]:
         "linkJointTypes": [fixed],
         "linkJointAxis": [[0.0, 0.0, 1.0]],
     }
+
+
+_INFO = {
+    "mass": 0,
+    "lateralFriction": 1,
+    "restitution": 5,
+    "rollingFriction": 6,
+    "spinningFriction": 7,
+    "contactDamping": 8,
+    "contactStiffness": 9,
+    "collisionMargin": 11,
+}
+"""Where getDynamicsInfo has each setting; the inertia, a list, is at 2."""
+
+
+def settings_in(engine: Any, body: int, link: int = -1) -> dict[str, float]:
+    """Return what the engine holds for a link of a body, -1 = its base."""
+    info = engine.getDynamicsInfo(body, link)
+    return {name: float(info[at]) for name, at in _INFO.items()}
+
+
+def require_taken(found: Mapping[str, float], wanted: Mapping[str, float], of: str) -> None:
+    """Raise if the engine holds other values than it was given.
+
+    Raises:
+        RealsimError: it does; the message names the first.
+    """
+    for name, value in wanted.items():
+        if abs(found[name] - value) > 1e-9 * max(1.0, abs(value)):
+            raise RealsimError(
+                f"PyBullet holds {name} = {found[name]:g} for {of} instead of {value:g}; its "
+                "results would be wrong. Was changeDynamics called with damping on a link?"
+            )

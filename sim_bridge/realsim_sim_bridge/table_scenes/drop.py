@@ -22,8 +22,7 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
-from realsim.models.convex import collision_obj
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in, shape_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in_shape, require_taken, settings_in
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.tables import TableModel
@@ -109,11 +108,9 @@ class DropWorld:
 
     def _shape(self, parts: list[Array]) -> tuple[int, float]:
         """Return a collision shape of convex parts and the margin that makes it as large."""
-        cores, margin = drawn_in(parts, self.config.margin_m)
         self._shapes += 1
         path = Path(self._folder.name) / f"shape{self._shapes}.obj"
-        path.write_bytes(collision_obj(cores))
-        return shape_in(self._engine, path, len(parts)), margin
+        return drawn_in_shape(self._engine, path, parts, self.config.margin_m)
 
     def _static(self, parts: list[Array]) -> int:
         shape, margin = self._shape(parts)
@@ -140,9 +137,7 @@ class DropWorld:
         )
         self._rough(number)
         self._roll(number)
-        held = float(self._engine.getDynamicsInfo(number, -1)[0])
-        if abs(held - solid.mass_kg) > 1e-9 * max(1.0, solid.mass_kg):
-            raise RealsimError(f"PyBullet holds a mass of {held:g} kg, not {solid.mass_kg:g} kg.")
+        require_taken(settings_in(self._engine, number), {"mass": solid.mass_kg}, f"object {key}")
         self.bodies[key] = _Body(number, T_body_obj, np.concatenate(solid.parts))
 
     def remove(self, key: int) -> None:
