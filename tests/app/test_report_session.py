@@ -1,10 +1,7 @@
 """One session's report: what it says, of whole sessions and of broken ones."""
 
-import html
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +21,7 @@ from realsim.pages import Cell, Page
 from realsim.review import journal
 from realsim.store import SessionStore, load_scene, save_grasps
 from registered_sessions import CAMERA
+from review_browser import needs_chromium, review_browser
 from shared_sessions import copy_of
 from tried_grasps import tried_set
 from typed_commands import invoked
@@ -212,8 +210,6 @@ def test_a_damaged_file_is_named_and_the_other_sections_stand(
 
 # --- Pages of a session fit the screen: tables scroll by themselves, never the page.
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
 
 @pytest.fixture(scope="module")
 def pages(registered_few: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
@@ -263,24 +259,15 @@ def test_what_a_table_marks_is_also_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_in_chromium_no_page_scrolls_sideways(pages: dict[str, Path], tmp_path: Path) -> None:
+@needs_chromium
+def test_in_chromium_no_page_scrolls_sideways(pages: dict[str, Path]) -> None:
     width = 390
-    for name, page in pages.items():
-        frame = tmp_path / "frame.html"
-        source = html.escape(page.read_text("utf-8"))
-        frame.write_text(
-            f'<iframe id="f" style="width:{width}px;height:900px;border:0" srcdoc="{source}">'
-            "</iframe><script>onload = () => { const e = f.contentDocument.documentElement;"
-            'document.title = e.scrollWidth + " of " + e.clientWidth; }</script>',
-            "utf-8",
-        )
-        done = subprocess.run(
-            [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu",
-             "--disable-dev-shm-usage", f"--user-data-dir={tmp_path / 'profile'}",
-             "--dump-dom", frame.as_uri()],
-            capture_output=True, text=True, timeout=120, check=True,
-        )  # fmt: skip
-        found = re.search(r"<title>(\d+) of (\d+)</title>", done.stdout)
-        assert found, name
-        assert int(found[1]) <= int(found[2]) and int(found[2]) > width - 40, name
+    with review_browser() as opened:
+        shown = opened.browser.new_page(viewport={"width": width, "height": 900})
+        for name, page in pages.items():
+            shown.goto(page.as_uri())
+            wide, seen = (
+                shown.evaluate(f"document.documentElement.{what}Width")
+                for what in ("scroll", "client")
+            )
+            assert wide <= seen and seen > width - 40, name

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim_capture_plans import ArmState, Frame
+from realsim_capture_plans import ArmState
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
@@ -17,6 +17,7 @@ from realsim_capture_plans.lab import LabConfig, SimulatedLab
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from device_checks import check_arm, check_camera
 
+LONGER = np.float32(1.03)
 LOOKING_DOWN = np.radians([180.0, -95.0, 115.0, -110.0, -90.0, 0.0])
 """(6,) over the table, in the range of the camera [rad]."""
 
@@ -56,12 +57,14 @@ def test_the_ur_driver_keeps_the_protocol(ur: UrArm) -> None:
     assert check_arm(ur) == []
 
 
-def changed(arm: Any, **fields: Any) -> Any:
-    def state() -> ArmState:
-        s = arm.state()
-        return replace(s, **{k: f(s) for k, f in fields.items()})
+def changed(device: Any, told_by: str = "state", **fields: Any) -> Any:
+    """Return a device of whose records, the arm's states or the camera's frames, some are wrong."""
 
-    return Wrong(arm, state=state)
+    def told() -> Any:
+        record = getattr(device, told_by)()
+        return replace(record, **{k: change(record) for k, change in fields.items()})
+
+    return Wrong(device, **{told_by: told})
 
 
 def millimetres(s: ArmState) -> Any:
@@ -85,20 +88,12 @@ def test_a_wrong_arm_is_named(lab: SimulatedLab) -> None:
     assert check_arm(changed(arm, joints=lambda s: s.joints)) == []
 
 
-def frames(camera: Any, **fields: Any) -> Any:
-    def grab() -> Frame:
-        f = camera.grab()
-        return replace(f, **{k: change(f) for k, change in fields.items()})
-
-    return Wrong(camera, grab=grab)
-
-
 def test_a_wrong_camera_is_named(lab: SimulatedLab) -> None:
     camera = lab.camera
     faults = {
-        "is it in metres?": frames(camera, depth_m=lambda f: 1e3 * f.depth_m),
-        "aligned by interpolation?": frames(camera, depth_m=lambda f: f.depth_m * np.float32(1.03)),
-        "exposed after the call": frames(camera, time_s=lambda f: 0.0),
+        "is it in metres?": changed(camera, "grab", depth_m=lambda f: 1e3 * f.depth_m),
+        "aligned by interpolation?": changed(camera, "grab", depth_m=lambda f: LONGER * f.depth_m),
+        "exposed after the call": changed(camera, "grab", time_s=lambda f: 0.0),
         "images are": Wrong(camera, intrinsics=replace(camera.intrinsics, width=640)),
         "not plain JSON": Wrong(camera, description={"noise": float("nan")}),
     }

@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from PIL import Image as PillowImage
 from page_tags import Tags
 from realsim.pages import Cell, Page, View, plots, spread
 from refusals import refused
+from review_browser import needs_chromium, review_browser
 
 
 def flat(r: int, g: int, b: int, width: int = 320, height: int = 180) -> np.ndarray:
@@ -162,24 +162,14 @@ def test_tables_that_do_not_fit_are_named() -> None:
 
 # --- in a real browser ------------------------------------------------------------------------
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-ARGS = [
-    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-dev-shm-usage",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
     (tmp_path / "page.html").write_bytes(everything().encode())
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=ARGS)
-        page = chromium.new_page(viewport={"width": 1100, "height": 900})
+    with review_browser() as opened:
+        page = opened.browser.new_page(viewport={"width": 1100, "height": 900})
         page.goto((tmp_path / "page.html").as_uri())
         yield page
-        chromium.close()
 
 
 def red_share(page: Any) -> float:
@@ -190,7 +180,7 @@ def red_share(page: Any) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@needs_chromium
 def test_in_chromium_sliders_views_layers_and_the_lightbox_work(browser: Any) -> None:
     assert red_share(browser) == pytest.approx(0.5, abs=0.02)
     browser.locator(".view.on .pair input").focus()
