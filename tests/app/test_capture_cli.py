@@ -22,7 +22,7 @@ from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan
-from typed_commands import complained, realsim
+from typed_commands import complained, finished, realsim
 
 VIEWS = 2
 
@@ -55,9 +55,7 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene_session(plans: Path) -> Path:
     out = plans / "session"
     words = ("--plan", plans / "plan.json", "--simulated", "--only-views", "0")
-    done = realsim("capture", out, *words)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "contact sheet" in done.stdout
+    assert "contact sheet" in finished("capture", out, *words).stdout
     return out
 
 
@@ -87,7 +85,7 @@ def test_what_a_killed_run_did_not_come_to_after_its_last_view_is_done_by_the_ne
     *views, end = log.read_text().splitlines(keepends=True)
     log.write_text("".join(views))
     words = ("--plan", plans / "plan.json", "--simulated", "--only-views", "0")
-    assert realsim("capture", tmp_path / "s", *words).returncode == 0
+    finished("capture", tmp_path / "s", *words)
     assert len(sheet.read_bytes()) > 0.9 * len(before)
     last = json.loads(log.read_text().splitlines()[-1])
     assert last["event"] == json.loads(end)["event"] == "ended" and last["complete"]
@@ -168,7 +166,7 @@ def test_a_robot_of_another_model_is_named_without_a_camera(plans: Path, tmp_pat
     with LoopbackController.start(robot="UR5e", speedup=10) as controller:
         words = ("--robot-host", controller.host, "--no-input", "--dry-run")
         done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", *words)
-    assert done.returncode == 2, done.stderr
+    assert done.returncode == 2
     assert "a UR5 is expected" in done.stderr and "UR5e" in done.stderr
     assert "no RealSense camera is connected" not in done.stderr
     assert "goes on from here" not in done.stdout and not (tmp_path / "s").exists()
@@ -182,9 +180,8 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
     with LoopbackController.start(robot="UR5", speedup=60, **words) as controller:
         command = ("capture", tmp_path / "s", "--plan", tmp_path / "four.json", "--robot-host",
                    controller.host, "--no-input")  # fmt: skip
-        done = realsim(*command, "--dry-run", "--views", "0-2")
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "nothing is looked at" in done.stdout and "nothing was stored" in done.stdout
+        said = finished(*command, "--dry-run", "--views", "0-2").stdout
+        assert "nothing is looked at" in said and "nothing was stored" in said
         # The arm really went: it stands at the last view asked for.
         np.testing.assert_allclose(controller.joints(), plan.joints[2], atol=1e-3)
         real = realsim(*command)
@@ -199,7 +196,7 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
 
 def seven_joint_plan(arm: str, path: Path) -> CapturePlan:
     """Write a plan of two views near where franky-sim's arm begins."""
-    home = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])
+    home = np.pi / 4 * np.array([0, 0, 0, -2, 0, 2, 1])
     joints = home + np.array([[0.05], [-0.05]]) * np.eye(7)[0]
     plan = plan_through(joints, home, [0.5, 0.0, 0.01], chain=find_arm(arm).chain)
     save_plan(plan, path)
@@ -221,10 +218,9 @@ def test_the_plan_of_a_franka_drives_a_franka(tmp_path: Path) -> None:
     try:
         (found,) = robot_findings(server.host)
         assert found.kind == "ok" and "FCI" in found.found
-        done = realsim("capture", tmp_path / "s", "--plan", tmp_path / "plan.json",
-                       "--robot-host", server.host, "--no-input", "--dry-run")  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "nothing is looked at" in done.stdout
+        words = ("--plan", tmp_path / "plan.json", "--robot-host", server.host, "--no-input")
+        said = finished("capture", tmp_path / "s", *words, "--dry-run").stdout
+        assert "nothing is looked at" in said
         np.testing.assert_allclose(server.joints(), plan.joints[1], atol=5e-3)
     finally:
         server.close()
@@ -246,9 +242,9 @@ def test_the_head_of_a_contact_sheet_is_whole(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_replay_file_is_not_replaced_unasked(plans: Path, tmp_path: Path) -> None:
+    replay = tmp_path / "replay.html"
     for there, told in (("precious", "no replay that this command wrote"),
                         ("a replay by viser", "--overwrite")):  # fmt: skip
-        (tmp_path / "replay.html").write_text(there)
-        words = ("plan-show", plans / "plan.json", "--replay-file", tmp_path / "replay.html")
-        assert told in complained(*words)
-        assert (tmp_path / "replay.html").read_text() == there
+        replay.write_text(there)
+        assert told in complained("plan-show", plans / "plan.json", "--replay-file", replay)
+        assert replay.read_text() == there

@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from realsim.errors import RealsimError
 from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, TagBoard
 from realsim.robots.arm import UR5 as UR5_ARM
 from realsim_calibration import (
     BoardView,
     TargetDetection,
     calibrate_hand_eye_report,
+    detection_of,
     diagnose,
     estimate_board_pose,
 )
@@ -47,16 +49,18 @@ def lab_views(slip: str = "") -> tuple[tuple[BoardView, ...], Any, Any]:
         if slip == "board" and k >= MOVED_FROM:
             now = se3.transform(lab.truth.T_world_board @ BOARD_STEP, board.points_board)
         uv = camera.project(lens, se3.transform(T_cam_world, now))
-        uv = uv + rng.normal(scale=PIXEL_NOISE, size=uv.shape)
-        inside = np.flatnonzero(np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=1))
-        seen = TargetDetection(
-            point_ids=inside, uv=uv[inside], image_size=(lens.width, lens.height)
-        )
+        seen = inside(board, lens, uv + rng.normal(scale=PIXEL_NOISE, size=uv.shape))
         state = lab.arm.state()
         views.append(
             BoardView(index=k, T_base_ee=state.T_base_ee, joints=state.joints, detection=seen)
         )
     return tuple(views), board, lab.camera.intrinsics
+
+
+def inside(board: TagBoard, lens: CameraIntrinsics, uv: np.ndarray) -> TargetDetection:
+    """Return the detection of those of a board's points that lie in the image."""
+    ids = np.flatnonzero(np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=1))
+    return detection_of(board, uv[ids], (lens.width, lens.height), ids)
 
 
 def hand_and_board() -> tuple[np.ndarray, np.ndarray]:
@@ -107,10 +111,7 @@ def one_axis() -> str:
     seen: list[BoardView] = []
     for k, A in enumerate(turns):
         uv = camera.project(factory, se3.transform(se3.invert(A @ X) @ Z, board.points_board))
-        size = (factory.width, factory.height)
-        inside = np.flatnonzero(np.all((uv > 0) & (uv < np.array(size) - 1), axis=1))
-        found = TargetDetection(point_ids=inside, uv=uv[inside], image_size=size)
-        seen.append(BoardView(index=k, T_base_ee=A, detection=found))
+        seen.append(BoardView(index=k, T_base_ee=A, detection=inside(board, factory, uv)))
     return checks_of(seen, board, factory)
 
 
