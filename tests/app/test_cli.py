@@ -10,7 +10,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import click
@@ -22,7 +21,7 @@ from realsim.app.front import COMMANDS, GROUPS, help_text
 from realsim.app.meanings import MEANINGS, OLD_NAMES
 from realsim.app.options import two_meanings
 from stored_sessions import flip, make_whole
-from typed_commands import complained, realsim, started
+from typed_commands import complained, realsim, started, wait_until
 
 HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
@@ -87,9 +86,7 @@ def test_2_is_bad_input(
 def test_130_is_interrupted(tmp_path: Path) -> None:
     words = ("demo", "--out", tmp_path / "d", "--workers", "1")
     with started(*words, stderr=subprocess.PIPE) as process:
-        until = time.monotonic() + 100
-        while not (tmp_path / "d/demo.json").is_file() and time.monotonic() < until:
-            time.sleep(0.1)
+        wait_until((tmp_path / "d/demo.json").is_file, process)
         # A compiler that calls back into Python swallows what is raised there: asked until it ends.
         for _ in range(5):
             process.send_signal(signal.SIGINT)

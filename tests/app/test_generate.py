@@ -3,14 +3,13 @@
 import json
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import pytest
 
 from bop_scenes import edit
 from file_trees import bytes_of
-from typed_commands import finished, invoked, refused, started
+from typed_commands import finished, invoked, refused, started, wait_until
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
          "--depth", "disparity", "--quiet")  # fmt: skip
@@ -92,8 +91,7 @@ def test_a_run_that_is_killed_goes_on_to_the_bytes_that_seed_and_number_make(
     out = tmp_path / "killed"
     arguments = [*SMALL, "--scenes", "2"]
     with started("generate", out, *arguments) as process:
-        while not (out / "scene_000000/rgb/000000.png").is_file() and process.poll() is None:
-            time.sleep(0.02)
+        wait_until((out / "scene_000000/rgb/000000.png").is_file, process)
         process.kill()
     assert process.returncode == -signal.SIGKILL
     finished("generate", out, *arguments, "--workers", "2")

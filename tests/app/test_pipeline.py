@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from unittest import mock
 
 import pytest
@@ -21,7 +20,7 @@ from realsim.app.pipeline.chain import SCENE, Ended
 from realsim.app.pipeline.page import page_of, verdicts_of
 from realsim.errors import InputError
 from realsim.pages import Page
-from typed_commands import invoked, realsim, started
+from typed_commands import invoked, realsim, started, wait_until
 
 HEAD = '[campaign]\nout = "out"\nstages = ["annotate", "export", "stats"]\n'
 SCENES = '[generate]\nscenes = 2\nviews = 2\nobjects = "2"\nsize = "160x120"\nrange = "d405"\n'
@@ -224,9 +223,7 @@ def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(whole, tm
     path, out = written(tmp_path), tmp_path / "out"
     words = ("pipeline", path, "--workers", "1")
     process = started(*words, start_new_session=True, stderr=subprocess.PIPE)
-    while not (out / "scenes/scene_000000/session.json").is_file():
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_until((out / "scenes/scene_000000/session.json").is_file, process)
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -3,6 +3,7 @@
 - `realsim`: the whole of `realsim.app.cli.main`, so that exit codes and messages are those of the
   program. Laws about the process itself (kills, terminals, what is imported) start one.
 - `started`: the program as a process of its own.
+- `wait_until`: what such a process is to come to.
 - `complained`: what the program said of bad input, which has to be in words.
 - `invoked`, `finished`, `refused`: the command alone, which says what it raised.
 """
@@ -11,7 +12,9 @@ import contextlib
 import io
 import subprocess
 import sys
+import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 from click.testing import CliRunner, Result
@@ -45,6 +48,15 @@ def started(*words: object, **options: Any) -> "subprocess.Popen[str]":
     code = "from realsim.app.cli import main; main()"
     line = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.Popen(line, text=True, **options)
+
+
+def wait_until(reached: Callable[[], object], process: "subprocess.Popen[str]") -> None:
+    """Wait until something is so; a process that ends before that is an error, as are minutes."""
+    end = time.monotonic() + 900
+    while not reached():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, process.args
+        time.sleep(0.005)
 
 
 def complained(*words: object) -> str:
