@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import Result
@@ -71,8 +72,6 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of every camera, a file of poses, and both targets."""
     folder = tmp_path_factory.mktemp("lab") / "pictures"
     rng = np.random.default_rng(3)
-    import cv2
-
     for name in ("wrist", *FIXED):
         (folder / name).mkdir(parents=True)
     Ts = hands(rng)
@@ -197,8 +196,6 @@ def test_what_is_missing_is_named(
 def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
     lab: Path, gray: int, words: str
 ) -> None:
-    import cv2
-
     for path in (lab / "right").glob("*.png"):
         cv2.imwrite(str(path), np.full((480, 640, 3), gray, np.uint8))
     keep_first(lab, ("wrist", "left"), 2)
@@ -255,8 +252,6 @@ def test_images_without_partners_are_left_out(lab: Path) -> None:
 
 
 def test_an_image_of_another_size_is_named_though_it_shows_no_board(lab: Path) -> None:
-    import cv2
-
     cv2.imwrite(str(lab / "left/004.png"), np.full((240, 320, 3), 90, np.uint8))
     said = refused(*words_for(lab))
     assert "camera 'left' has images of several sizes" in said and "004.png (320x240)" in said

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -163,8 +164,6 @@ def test_degrees_under_names_of_radians_are_asked_for_by_their_unit(lab):
 
 @pytest.mark.parametrize("what", ["corners", "axes"])
 def test_drawings_on_the_target_are_named(lab, what, capsys):
-    import cv2
-
     shots, hands = pictures()
     target, drawn = TARGETS["chessboard"], {}
     for k in (2, 5):
@@ -196,8 +195,6 @@ def test_two_boards_among_the_images_are_named(lab, capsys):
 
 
 def test_a_blurred_picture_is_dropped_with_its_reason(lab):
-    import cv2
-
     shots, _ = pictures()
     replace_pictures(lab, {4: cv2.GaussianBlur(shots[4], (0, 0), 15.0)})
     found = read(lab)
@@ -209,21 +206,16 @@ def test_a_blurred_picture_is_dropped_with_its_reason(lab):
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (
-            lambda cv2, p: cv2.GaussianBlur(p, (0, 0), 12.0),
-            ["picture is blurred", "1 sigma", "rest"],
-        ),
-        (lambda cv2, p: (p * 0.04).astype(np.uint8), ["too dark, under-exposed", "Expose longer"]),
+        (lambda p: cv2.GaussianBlur(p, (0, 0), 12.0), ["picture is blurred", "1 sigma", "rest"]),
+        (lambda p: (p * 0.04).astype(np.uint8), ["too dark, under-exposed", "Expose longer"]),
     ],
     ids=["blurred", "dark"],
 )
 def test_pictures_that_show_nothing_are_named_for_their_fault(lab, spoil, said):
-    import cv2
-
     shots, hands = pictures()
     for path in lab.glob("*.png"):
         path.unlink()
-    replace_pictures(lab, {k: spoil(cv2, shot) for k, shot in enumerate(shots[:4])})
+    replace_pictures(lab, {k: spoil(shot) for k, shot in enumerate(shots[:4])})
     write_matrices(lab / "poses.json", hands[:4])
     text = " ".join(refused("found in none of the 4 images", read, lab).split())
     assert all(words in text for words in said)
