@@ -61,10 +61,15 @@ def session(known, tmp_path):
     return session_of(known, tmp_path / "session")
 
 
+@pytest.fixture
+def mesh_file(known, tmp_path):
+    save_ply(tmp_path / "mug.ply", known.scan, "m")
+    return tmp_path / "mug.ply"
+
+
 def named_of(known) -> NamedMesh:
-    mesh = known.scan
-    sha256 = inputs.mesh_hash(mesh)
-    return NamedMesh(mesh=mesh, name="mug", origin="file", where="mug.ply", sha256=sha256)
+    sha256 = inputs.mesh_hash(known.scan)
+    return NamedMesh(mesh=known.scan, name="mug", origin="file", where="mug.ply", sha256=sha256)
 
 
 def inputs_of(request, named, session):
@@ -97,11 +102,10 @@ def test_views_that_do_not_do_are_named(known, tmp_path, kept, wanted, said):
         assert len(usable_views(store, ())) == 6
 
 
-def test_a_damaged_depth_image_is_named(known, session, tmp_path):
-    save_ply(tmp_path / "mug.ply", known.scan, "m")
+def test_a_damaged_depth_image_is_named(mesh_file, session):
     path = session.path("depth/000002.png")
     path.write_bytes(path.read_bytes()[:-20])
-    request = ScaleRequest(mesh=str(tmp_path / "mug.ply"), session=session.folder)
+    request = ScaleRequest(mesh=str(mesh_file), session=session.folder)
     refused("000002", run_scale, request, CONSOLE)
 
 
@@ -164,13 +168,9 @@ def test_the_key_changes_with_every_input_and_with_nothing_else(known, session):
     key = key_of(known, session)
     assert key == key_of(known, session, overwrite=True, out=Path("elsewhere"))
     m = parse_measurement("longest=120mm")
-    others = [
-        key_of(known, session, at=(0.1, 0.0)),
-        key_of(known, session, size_m=0.1),
-        key_of(known, session, views=(0, 1, 2)),
-        key_of(known, session, measured=(m,)),
-        key_of(known, session, measured=(replace(m, sigma_m=2e-3),)),
-    ]
+    measured = ({"measured": (m,)}, {"measured": (replace(m, sigma_m=2e-3),)})
+    changes = ({"at": (0.1, 0.0)}, {"size_m": 0.1}, {"views": (0, 1, 2)}, *measured)
+    others = [key_of(known, session, **change) for change in changes]
     session.set_cameras(known.views.intrinsics, {0: known.views.frames[1].T_world_cam})
     others.append(key_of(known, session))
     assert len({key, *others}) == len(others) + 1
@@ -241,13 +241,6 @@ def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
 
 
 # --- whole runs -------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def mesh_file(known, tmp_path):
-    path = tmp_path / "mug.ply"
-    save_ply(path, known.scan, "m")
-    return path
 
 
 def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path):

@@ -32,6 +32,11 @@ def fresh(store: SessionStore, index: int, width_px: int = 40, quality: int = 70
     return thumbnail(store.rgb(index), width_px, quality)
 
 
+def flipped(data: bytes, place: int) -> bytes:
+    """Return bytes of which one is another."""
+    return data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :]
+
+
 # --- what is kept -----------------------------------------------------------------------------
 
 
@@ -53,10 +58,8 @@ def test_a_damaged_or_foreign_one_is_made_anew(store: SessionStore, damage: str)
     opened(store).of(INDICES, {})
     file = store.folder / FOLDER / "000001.jpg"
     whole = file.read_bytes()
-    data = bytearray(whole)
-    data[len(data) // 3] ^= 0x10
     spoiled = {
-        "cut": whole[: len(whole) // 2], "flipped": bytes(data), "emptied": b"",
+        "cut": whole[: len(whole) // 2], "flipped": flipped(whole, len(whole) // 3), "emptied": b"",
         "other": b"not a picture", "unsigned": whole[: whole.rfind(b"\nrealsim ")],
         "swapped": (store.folder / FOLDER / "000002.jpg").read_bytes(),
     }  # fmt: skip
@@ -138,13 +141,10 @@ def test_damaged_files_are_the_ordinary_readers_errors(tmp_path: Path, damage: s
     rows = rng.integers(0, 256, (20, 91), dtype=np.uint8)
     rows[:, 0] = 9 if damage == "filter" else 3
     data = png_of(rows, 30, 8, 2)
-    flipped = bytearray(data)
-    flipped[len(data) // 2] ^= 0x40
-    claim = bytearray(data)
-    claim[16:24] = struct.pack(">II", 200_000, 400)
     spoiled = {
-        "cut": data[:-30], "flipped": bytes(flipped), "filter": data, "claim": bytes(claim),
-        "empty": b"", "text": b"hello",
+        "cut": data[:-30], "flipped": flipped(data, len(data) // 2), "filter": data,
+        "claim": data[:16] + struct.pack(">II", 200_000, 400) + data[24:], "empty": b"",
+        "text": b"hello",
     }  # fmt: skip
     path = tmp_path / "image.png"
     if damage != "gone":

@@ -9,6 +9,7 @@ import pytest
 import viser
 
 from realsim import Mesh
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
@@ -23,10 +24,11 @@ WIDTH_M = 0.03
 TRIANGLE = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]], dtype=np.int32))
 
 
-def approach(seed: int = 0, width_m: float = WIDTH_M) -> GraspMotion:
-    rng = np.random.default_rng(seed)
-    T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
-    return hand_approach(4, 2, T_world_obj, T_obj_grasp, width_m, find_hand())
+T_WORLD_OBJ, T_OBJ_GRASP, T_MOVE = se3.random_transform(np.random.default_rng(3), 3)
+
+
+def approach(T_world_obj: Array = T_WORLD_OBJ, width_m: float = WIDTH_M) -> GraspMotion:
+    return hand_approach(4, 2, T_world_obj, T_OBJ_GRASP, width_m, find_hand())
 
 
 def carried(seconds: float = 0.4, rate_hz: float = 50.0) -> GraspMotion:
@@ -46,32 +48,25 @@ def carried(seconds: float = 0.4, rate_hz: float = 50.0) -> GraspMotion:
 
 
 def test_the_approach_ends_in_the_grasp_with_closed_fingers() -> None:
-    rng = np.random.default_rng(3)
-    T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
-    motion = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
-    closing = motion.phase == PHASES.index("close")
-    np.testing.assert_allclose(
-        motion.Ts_world_hand[closing],
-        np.tile(T_world_obj @ T_obj_grasp, (closing.sum(), 1, 1)), atol=1e-12,
-    )  # fmt: skip
+    motion = approach()
+    closing = motion.Ts_world_hand[motion.phase == PHASES.index("close")]
+    grasp = np.broadcast_to(T_WORLD_OBJ @ T_OBJ_GRASP, closing.shape)
+    np.testing.assert_allclose(closing, grasp, atol=1e-12)
     assert motion.opening_m[-1] == pytest.approx(WIDTH_M, abs=1e-12)
     assert motion.opening_m[0] == find_hand().max_opening_m
 
 
 @pytest.mark.parametrize("width_m", [0.0, 0.11])
 def test_time_increases_and_fingers_only_close(width_m: float) -> None:
-    motion = approach(1, width_m)
+    motion = approach(width_m=width_m)
     assert np.all(np.diff(motion.time_s) > 0)
     assert np.all(np.diff(motion.opening_m) <= 1e-12) and motion.opening_m.min() >= width_m
 
 
 def test_the_approach_moves_with_the_world() -> None:
-    rng = np.random.default_rng(5)
-    T, T_world_obj, T_obj_grasp = (se3.random_transform(rng) for _ in range(3))
-    a = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
-    b = hand_approach(0, 0, T @ T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
-    np.testing.assert_allclose(b.Ts_world_hand, T @ a.Ts_world_hand, atol=1e-12)
-    np.testing.assert_allclose(b.Ts_world_obj, T @ a.Ts_world_obj, atol=1e-12)
+    a, b = approach(), approach(T_MOVE @ T_WORLD_OBJ)
+    np.testing.assert_allclose(b.Ts_world_hand, T_MOVE @ a.Ts_world_hand, atol=1e-12)
+    np.testing.assert_allclose(b.Ts_world_obj, T_MOVE @ a.Ts_world_obj, atol=1e-12)
     np.testing.assert_array_equal(a.time_s, b.time_s)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from begun_sessions import add_drawn, begun
-from plain_meshes import box
+from plain_meshes import square
 from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import sample_surface
@@ -111,7 +111,7 @@ def test_a_symmetric_object_keeps_the_turn_it_was_given(tmp_path: Path) -> None:
 def tube_session(folder: Path) -> tuple[SessionStore, ObjectPose]:
     """Return a session of one tube on a table, and where it stands."""
     T = se3.from_translation([0.0, 0.0, -TUBE.mesh.bounds[0, 2]])
-    table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.0, 0.0, -0.01]))
+    table = PlacedMesh(-1, square(0.5), np.eye(4))
     renderer = LabelRenderer([PlacedMesh(0, TUBE.mesh, T), table])
     store = add_drawn(begun(folder, CAMERA), renderer, true_cameras(3))
     return store, ObjectPose(obj_id=TUBE.obj_id, instance=0, T_world_obj=T)

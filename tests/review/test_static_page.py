@@ -83,9 +83,8 @@ def test_what_people_wrote_is_text(written: StaticSummary) -> None:
 def test_texts_of_people_stay_on_their_line(content: SceneContent, tmp_path: Path) -> None:
     first = content.scene.objects[0]
     line = journal.new_entry("reject", first, "eve\nbob", comment="no\r\nbob, 2026: accepted")
-    path = tmp_path / "scene.html"
-    write_static(content, journal.replay([line]), path, title="Scene")
-    page = path.read_text()
+    made = write_static(content, journal.replay([line]), tmp_path / "scene.html", title="Scene")
+    page = made.path.read_text()
     assert "no bob, 2026: accepted" in page and "reviewed by eve bob" in page
     assert "<p>rejected by eve bob, " in page
 
@@ -246,8 +245,8 @@ def test_a_click_in_the_list_chooses_an_object(page: Any) -> None:
 
 @pytest.mark.slow
 def test_the_switches_show_and_hide(page: Any) -> None:
-    for what, node in (("cloud", "/cloud"), ("objects", "/objects/1"), ("table", "/table"),
-                       ("cameras", "/cameras/2")):  # fmt: skip
+    nodes = {"cloud": "/cloud", "objects": "/objects/1", "table": "/table", "cameras": "/cameras/2"}
+    for what, node in nodes.items():
         page.evaluate(f"document.querySelector('[data-show={what}]').click()")
         assert becomes(page, node, False), what
         page.evaluate(f"document.querySelector('[data-show={what}]').click()")
