@@ -16,7 +16,7 @@ from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
 from realsim.formats.bop.source import open_bop
 from realsim.geometry import se3
-from realsim.geometry.mesh import symmetry_transforms
+from realsim.geometry.mesh import save_ply, symmetry_transforms
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 from refusals import refused
 from trimesh_solids import box
@@ -225,8 +225,6 @@ def test_models_in_the_wrong_unit_are_found_out(tmp_path):
     bop_models.save_models(tmp_path, models)
     edit(tmp_path / "models_info.json", lambda d: d["1"].update(diameter=0.104))
     refused(r"models_info\.json says 0\.104 mm", bop_models.load_models, tmp_path, error=UnitError)
-    from realsim.geometry.mesh import save_ply
-
     save_ply(tmp_path / "obj_000001.ply", box((0.06, 0.06, 0.06)), "m")
     refused("scan import FILE --unit m` makes", bop_models.load_models, tmp_path, error=UnitError)
     refused("nowhere does not exist; files obj", bop_models.load_models, tmp_path / "nowhere")

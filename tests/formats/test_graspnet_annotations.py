@@ -32,11 +32,9 @@ from realsim.geometry.camera import undistort
 from realsim.geometry.mesh import load_mesh
 from refusals import refused
 
-COUNT = 300
-
 
 def test_poses_lose_nothing_in_the_text():
-    Ts = se3.random_transform(np.random.default_rng(2), COUNT, spread=0.5)
+    Ts = se3.random_transform(np.random.default_rng(2), 300, spread=0.5)
     for T in Ts:
         off = se3.invert(T) @ pose_of(object_fields(4, T))
         assert np.linalg.norm(off[:3, 3]) < 1e-9 and se3.angle(off) < 1e-8

@@ -40,15 +40,6 @@ SINGLE = 2e-7
 """Rounding of numbers about 1 to single precision, both ways."""
 
 
-def a_group(seed=0, n=20):
-    rng = np.random.default_rng(seed)
-    return GraspGroup(
-        Ts_a_grasp=se3.random_transform(rng, n, 0.5), scores=rng.normal(size=n),
-        openings_m=rng.uniform(0, 0.1, n), heights_m=np.full(n, 0.02),
-        depths_m=rng.choice(frame.DEPTHS_M, n), obj_ids=rng.integers(0, 89, n),
-    )  # fmt: skip
-
-
 def some_labels(seed=0, points=20, n=150):
     """Return labels of every level, some of them in the object, single precision throughout."""
     rng = np.random.default_rng(seed)
@@ -228,9 +219,9 @@ def test_a_rectangle_has_the_grippers_opening_and_height_in_pixels():
     T = np.eye(4)[None].repeat(2, axis=0)
     T[:, :3, 3] = [0.0, 0.0, 0.52]  # approach = camera z, closing = camera y
     T[1] = T[1] @ se3.from_rt(se3.exp_so3([0.3, 0, 0]), [0, 0, 0])  # 17 deg: no rectangle
-    group = replace(
-        a_group(n=2), Ts_a_grasp=T, openings_m=np.full(2, 0.08), depths_m=np.full(2, 0.02),
-        obj_ids=np.array([1, 2]),
+    group = GraspGroup(
+        Ts_a_grasp=T, scores=np.array([0.7, -0.3]), openings_m=np.full(2, 0.08),
+        heights_m=np.full(2, 0.02), depths_m=np.full(2, 0.02), obj_ids=np.array([1, 2]),
     )  # fmt: skip
     (row,) = rect_rows(group, camera)
     side, high = 600 * 0.04 / 0.48, 600 * 0.02 / 0.48

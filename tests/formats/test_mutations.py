@@ -26,11 +26,8 @@ worker: Any = importlib.import_module("formats_mutations_worker")
 scenes: Any = importlib.import_module("formats_mutations_scenes")
 
 
-SOUND = list(mutations.SAMPLES)
-
-
 def test_damaged_files_are_refused_or_read() -> None:
-    found = list(mutations.mutations(40, 4_000, 1, SOUND[::5]))
+    found = list(mutations.mutations(40, 4_000, 1, list(mutations.SAMPLES)[::5]))
     assert len(found) == 40
     assert [o for o in found if o.kind not in mutations.RIGHT] == []
     assert sum(o.kind == "refused" for o in found) > 10  # the damage is real

@@ -9,7 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from pxr import Gf, Usd, UsdGeom, UsdUtils
 
 from bop_scenes import edit
 from realsim.errors import MissingLibraryError, UnitError
@@ -94,8 +96,6 @@ def test_textures_come_back_from_usd(tmp_path, packed):
     path = tmp_path / "box.usda"
     write_usd(path, box)
     if packed:
-        from pxr import UsdUtils
-
         UsdUtils.CreateNewUsdzPackage(str(path), str(tmp_path / "box.usdz"))
         path = tmp_path / "box.usdz"
     scan = read_scan(path, None)
@@ -106,8 +106,6 @@ def test_textures_come_back_from_usd(tmp_path, packed):
 
 
 def test_several_textures_become_one_with_all_colours(tmp_path):
-    import trimesh
-
     first = textured_box(seed=1)
     second = textured_box((0.03, 0.03, 0.09), seed=2)
     second = replace(second, vertices=second.vertices + np.array([0.12, 0.02, 0.0]))
@@ -142,8 +140,6 @@ def test_a_repeated_texture_keeps_its_pattern_in_an_atlas():
 
 
 def test_nodes_are_placed_and_mirrored_ones_stay_outward(tmp_path):
-    import trimesh
-
     solid = as_trimesh(BRACKET)
     scene = trimesh.Scene()
     T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3], [0.0, 0.1, 0.0])
@@ -162,8 +158,6 @@ def test_nodes_are_placed_and_mirrored_ones_stay_outward(tmp_path):
 
 
 def test_usd_transforms_instances_and_mirrors(tmp_path):
-    from pxr import Gf, Usd, UsdGeom
-
     write_usd(tmp_path / "part.usda", BRACKET)
     stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -203,8 +197,6 @@ def test_usd_transforms_instances_and_mirrors(tmp_path):
 def test_usd_left_handed_winding_is_turned(tmp_path):
     inside_out = replace(BRACKET, faces=BRACKET.faces[:, ::-1])
     stage = write_usd(tmp_path / "a.usda", inside_out)
-    from pxr import UsdGeom
-
     UsdGeom.Mesh(stage.GetPrimAtPath("/thing/shape")).CreateOrientationAttr("leftHanded")
     stage.GetRootLayer().Save()
     scan = read_scan(tmp_path / "a.usda", None)

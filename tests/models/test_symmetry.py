@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from real_data import DATA, needs
 from realsim.geometry import se3
@@ -28,8 +29,6 @@ YCBV_MODELS = DATA / "scenes/ycbv_mini/models"
 
 
 def hull(points, size_m=0.05):
-    import trimesh
-
     return solid(trimesh.convex.convex_hull(size_m * np.asarray(points, dtype=float)))
 
 
@@ -45,8 +44,6 @@ def slowly(quick, *slow):
 
 def subdivided(mesh, rng, times, noise_m):
     """Return the same surface with more, unequal triangles and moved vertices."""
-    import trimesh
-
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces)
     for _ in range(times):
         some = rng.permutation(len(shape.faces))[: len(shape.faces) * 2 // 3]
@@ -335,8 +332,6 @@ def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces() -> None:
 
 @pytest.mark.parametrize("name", ["l_bracket", "wedge"])
 def test_poses_and_probabilities_are_those_of_trimesh(name: str) -> None:
-    import trimesh
-
     mesh = part(name).mesh
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     T, chance = solid.compute_stable_poses(sigma=0, n_samples=1, threshold=0.0)

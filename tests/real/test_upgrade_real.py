@@ -21,6 +21,7 @@ from real_data import DATA, needs
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.console import Console
 from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
+from realsim.interop import import_open3d
 
 YCBV = DATA / "scenes/ycbv_mini"
 pytestmark = [pytest.mark.real, pytest.mark.slow, needs(YCBV)]
@@ -45,8 +46,6 @@ def upgraded(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def meshes(upgraded):
-    from realsim.interop import import_open3d
-
     o3d = import_open3d()
 
     scenes = {}
@@ -60,8 +59,6 @@ def meshes(upgraded):
 
 def rendered_distance_mm(scene, row, K, size):
     """Return the distance image (3 H, 3 W) [mm] of a model on BOP's large canvas, 0 = nothing."""
-    from realsim.interop import import_open3d
-
     o3d = import_open3d()
 
     width, height = size

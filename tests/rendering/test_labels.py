@@ -38,11 +38,6 @@ def view() -> np.ndarray:
     return se3.look_at([0.15, -0.3, 0.3], [0.4, 0.0, 0.03])
 
 
-def cropped(i: CameraIntrinsics, x: int, y: int, width: int, height: int) -> CameraIntrinsics:
-    return CameraIntrinsics(width=width, height=height, fx=i.fx, fy=i.fy, cx=i.cx - x,
-                            cy=i.cy - y, distortion=i.distortion)  # fmt: skip
-
-
 @pytest.mark.parametrize("distortion", [np.zeros(5), LENS, [0.9, 0.3, 5e-4, -3e-4, 0.02, 1.2, 0.5]])
 def test_hits_project_onto_their_own_pixel(distortion: np.ndarray) -> None:
     import cv2
@@ -93,10 +88,11 @@ def test_amodal_is_the_render_of_the_object_alone() -> None:
 def test_count_beyond_the_border_does_not_depend_on_the_crop() -> None:
     placed = clutter()
     whole = LabelRenderer(placed).render(CAMERA, view())
-    for crop in ((100, 60, 120, 70), (140, 20, 110, 90)):
-        part = LabelRenderer(placed).render(cropped(CAMERA, *crop), view())
+    for x, y, width, height in ((100, 60, 120, 70), (140, 20, 110, 90)):
+        at = (CAMERA.cx - x, CAMERA.cy - y)
+        cropped = replace(CAMERA, width=width, height=height, cx=at[0], cy=at[1])
+        part = LabelRenderer(placed).render(cropped, view())
         assert part.px_count_all == whole.px_count_all
-        x, y, width, height = crop
         assert np.array_equal(part.ids, whole.ids[y : y + height, x : x + width])
         for p in placed[1:]:
             inside = whole.amodal[p.instance][y : y + height, x : x + width]

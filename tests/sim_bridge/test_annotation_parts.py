@@ -189,18 +189,15 @@ OBJECTS = tuple(
 )
 
 
-def grasps_of_the_book() -> GraspSet:
-    """Return a grasp from above in the middle of the book."""
-    T = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.01])
-    return plain_grasps(
-        T[None], obj_id=2, instance=2, widths_m=[0.11], scores=np.ones(1), base_scores=np.ones(1)
-    )
-
-
+# A grasp from above in the middle of the book.
+GRASP_OF_THE_BOOK = plain_grasps(
+    se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.01])[None], obj_id=2, instance=2,
+    widths_m=[0.11], scores=np.ones(1), base_scores=np.ones(1),
+)  # fmt: skip
 CONFIG = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
 INPUTS = FrameInputs(
     config=CONFIG, intrinsics=CAMERA, depth_unit_m=1e-4, objects=OBJECTS, models=MODELS,
-    grasp_sets=(grasps_of_the_book(),), digest="",
+    grasp_sets=(GRASP_OF_THE_BOOK,), digest="",
     surroundings=(PlacedMesh(BACKGROUND, table_slab(CONFIG), np.eye(4)),),
 )  # fmt: skip
 

@@ -30,13 +30,9 @@ from refusals import refused
 
 SMALL = ValidationConfig(
     limits=LimitConfig(
-        cases=((20.0, 0.25),),
-        directions_deg=(0.0, 45.0, 90.0),
-        coulomb_shares=(0.9, 0.97, 1.03, 1.1),
-        torque_cases=((20.0, 0.25),),
-        torque_shares=(0.9, 1.1),
-        arms_m=(0.03,),
-        creep_s=1.0,
+        cases=((20.0, 0.25),), directions_deg=(0.0, 45.0, 90.0),
+        coulomb_shares=(0.9, 0.97, 1.03, 1.1), torque_cases=((20.0, 0.25),),
+        torque_shares=(0.9, 1.1), arms_m=(0.03,), creep_s=1.0,
     ),
     stages=StageConfig(box_masses_kg=(0.013,)),
     labels=LabelConfig(

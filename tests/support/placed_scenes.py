@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.placed_scene import SceneCamera
+from realsim.formats.robot_scenes.placed_scene import SceneCamera, seen_from
 from realsim.formats.robot_scenes.placing import Matter, place_scene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
@@ -103,8 +103,6 @@ def same_bodies(scene, found, tolerance=0.0, shapes=0.0):
 
 def turned_to(scene, seed=3):
     """Return the scene in another world: its table stands aslant there."""
-    from realsim.formats.robot_scenes.placed_scene import seen_from
-
     return seen_from(scene, se3.random_transform(np.random.default_rng(seed)))
 
 

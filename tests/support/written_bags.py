@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from realsim.errors import InputError
@@ -42,15 +44,10 @@ class Bag:
     def write(self) -> Path:
         writer: Any
         if self.is_ros1:
-            from rosbags.rosbag1 import Writer
-
-            writer = Writer(self.path)
+            writer = rosbag1.Writer(self.path)
         else:
-            from rosbags.rosbag2 import StoragePlugin
-            from rosbags.rosbag2 import Writer as Writer2
-
             plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
-            writer = Writer2(self.path, version=9, storage_plugin=plugin)
+            writer = rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
         serialize = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
         with writer:
             connections: dict[str, Any] = {}

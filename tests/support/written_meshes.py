@@ -1,6 +1,9 @@
 """Meshes with textures, and files of them as other programs write them."""
 
 import numpy as np
+import trimesh
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from realsim.records import Mesh
 
@@ -13,8 +16,6 @@ def colorful_texture(n=32, seed=0):
 
 def textured_box(extents=(0.1, 0.06, 0.04), seed=0):
     """A closed box whose six sides are six charts of one texture."""
-    import trimesh
-
     solid = trimesh.creation.box(extents)
     vertices, faces, uv = [], [], []
     normals = np.asarray(solid.face_normals)
@@ -29,17 +30,12 @@ def textured_box(extents=(0.1, 0.06, 0.04), seed=0):
         faces.append(np.searchsorted(corners, mine) + 4 * side)
         vertices.append(points)
     return Mesh(
-        vertices=np.concatenate(vertices),
-        faces=np.concatenate(faces),
-        uv=np.concatenate(uv),
+        vertices=np.concatenate(vertices), faces=np.concatenate(faces), uv=np.concatenate(uv),
         texture=colorful_texture(seed=seed),
-    )
+    )  # fmt: skip
 
 
 def as_trimesh(mesh):
-    import trimesh
-    from PIL import Image
-
     solid = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
     if mesh.texture is not None:
         material = trimesh.visual.material.PBRMaterial(
@@ -60,8 +56,6 @@ def write_gltf(path, mesh, *, with_picture=True):
 
 
 def write_textured_obj(path, mesh, texture_name="skin.png"):
-    from PIL import Image
-
     Image.fromarray(mesh.texture.copy()).save(path.parent / "skin.png")
     path.with_suffix(".mtl").write_text(f"newmtl skin\nKd 0.4 0.4 0.4\nmap_Kd {texture_name}\n")
     lines = [f"mtllib {path.with_suffix('.mtl').name}", "usemtl skin"]
@@ -73,9 +67,6 @@ def write_textured_obj(path, mesh, texture_name="skin.png"):
 
 def write_usd(path, mesh, *, metres=1.0, up="Z", texture="skin.png"):
     """Write a mesh with a UsdPreviewSurface; faceVarying coordinates, as exporters do."""
-    from PIL import Image
-    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
-
     stage = Usd.Stage.CreateNew(str(path))
     if metres is not None:
         UsdGeom.SetStageMetersPerUnit(stage, metres)

@@ -25,9 +25,6 @@ from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_js
 from refusals import refused
 from tried_grasps import assert_same, tried_set
 
-few = settings(max_examples=10, deadline=None)
-seeds = st.integers(0, 2**32 - 1)
-
 
 def through_text(value):
     return json.loads(json.dumps(value, allow_nan=False))
@@ -74,8 +71,8 @@ def views(rng):
     )  # fmt: skip
 
 
-@few
-@given(seeds)
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1))
 @pytest.mark.parametrize("make", [camera, views, hand_eye, scene])
 def test_reading_undoes_writing_bit_for_bit(make, seed):
     record = make(np.random.default_rng(seed))

@@ -242,9 +242,8 @@ def test_llvm_asked_for_and_not_there_is_an_error_that_offers_the_other(
 def test_without_llvm_the_scalar_variant_renders_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from realsim.rendering.photoreal import variant
-
-    monkeypatch.setattr(variant, "_prepare_llvm", lambda: "no library was found")
+    prepared = "realsim.rendering.photoreal.variant._prepare_llvm"
+    monkeypatch.setattr(prepared, lambda: "no library was found")
     renderer = PhotorealRenderer([], SKY, PhotorealConfig(samples=1))
     assert renderer.variant == "scalar_rgb"
     assert any("without LLVM" in n and "no library was found" in n for n in renderer.notes)
