@@ -84,22 +84,12 @@ def test_textures_come_back_from_every_format(tmp_path):
     as_trimesh(box).export(tmp_path / "box.glb")
     write_textured_obj(tmp_path / "box.obj", box)
     save_ply(tmp_path / "box.ply", box, "m")
-    for name in ("box.glb", "box.obj", "box.ply"):
-        scan = read_scan(tmp_path / name, "m", up="z")
-        assert colour_agreement(box, scan.mesh) > 0.99, name
+    write_usd(tmp_path / "box.usda", box)
+    UsdUtils.CreateNewUsdzPackage(str(tmp_path / "box.usda"), str(tmp_path / "box.usdz"))
+    for ending, unit in (("glb", "m"), ("obj", "m"), ("ply", "m"), ("usda", None), ("usdz", None)):
+        scan = read_scan(tmp_path / f"box.{ending}", unit, up="z")
+        assert colour_agreement(box, scan.mesh) > 0.99, ending
         np.testing.assert_array_equal(scan.mesh.texture, box.texture)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_textures_come_back_from_usd(tmp_path, packed):
-    box = textured_box()
-    path = tmp_path / "box.usda"
-    write_usd(path, box)
-    if packed:
-        UsdUtils.CreateNewUsdzPackage(str(path), str(tmp_path / "box.usdz"))
-        path = tmp_path / "box.usdz"
-    scan = read_scan(path, None)
-    assert colour_agreement(box, scan.mesh) > 0.99
 
 
 # --- several parts -------------------------------------------------------------------------------
@@ -321,6 +311,10 @@ def broken_files():
         ),
         "point.off": (b"OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n", "no extent"),
         "shape.step": (b"ISO-10303-21;", "not a mesh format"),
+        "noise.usda": (b"#usda 1.0\n(nonsense", ""),
+        "noise.usdz": (noise, ""),
+        "nothing.usda": (b"#usda 1.0\n(metersPerUnit = 1)\n", ""),
+        "lost.usda": (b'#usda 1.0\ndef Xform "a" (references = @./gone.usda@</a>) {}\n', ""),
     }
 
 
@@ -329,16 +323,6 @@ def test_bad_files_are_named(tmp_path):
         (tmp_path / name).write_bytes(data)
         assert says in refused(name, read_scan, tmp_path / name, "m")
     refused("does not exist", read_scan, tmp_path / "nothing.glb", "m")
-
-
-def test_bad_usd_files_are_named(tmp_path):
-    (tmp_path / "noise.usda").write_text("#usda 1.0\n(nonsense")
-    (tmp_path / "noise.usdz").write_bytes(bytes(range(256)))
-    (tmp_path / "nothing.usda").write_text("#usda 1.0\n(metersPerUnit = 1)\n")
-    lost = 'def Xform "a" (references = @./gone.usda@</a>) {}'
-    (tmp_path / "lost.usda").write_text(f"#usda 1.0\n{lost}\n")
-    for name in ("noise.usda", "noise.usdz", "nothing.usda", "lost.usda"):
-        refused(name, read_scan, tmp_path / name, "m")
 
 
 def test_without_the_extra_usd_says_what_to_install(tmp_path, monkeypatch):
@@ -375,27 +359,18 @@ def test_a_missing_texture_is_a_note(tmp_path):
 
 @pytest.mark.parametrize("name", ["../skin.png", "/etc/hostname"])
 def test_files_do_not_read_outside_their_folder(tmp_path, name):
-    box = textured_box()
-    (tmp_path / "in").mkdir()
-    write_textured_obj(tmp_path / "in/a.obj", box, texture_name=name)
-    (tmp_path / "in/skin.png").rename(tmp_path / "skin.png")
-    refused("outside its own folder", read_scan, tmp_path / "in/a.obj", "m")
+    box, inside = textured_box(), tmp_path / "in"
+    inside.mkdir()
+    write_textured_obj(inside / "a.obj", box, texture_name=name)
+    write_usd(inside / "a.usda", box, texture=name)
+    (inside / "skin.png").rename(tmp_path / "skin.png")
     header = {"asset": {"version": "2.0"}, "buffers": [{"uri": name, "byteLength": 3}]}
     header |= {"meshes": [], "bufferViews": [{"buffer": 0, "byteLength": 3}]}
-    (tmp_path / "in/a.gltf").write_text(json.dumps(header))
-    refused("outside its own folder", read_scan, tmp_path / "in/a.gltf", "m")
-
-
-@pytest.mark.parametrize("name", ["../skin.png", "/etc/hostname"])
-def test_usd_does_not_read_outside_its_folder(tmp_path, name):
-    box = textured_box()
-    (tmp_path / "in").mkdir()
-    write_usd(tmp_path / "in/a.usda", box, texture=name)
-    (tmp_path / "in/skin.png").rename(tmp_path / "skin.png")
-    refused("outside its own folder", read_scan, tmp_path / "in/a.usda", None)
+    (inside / "a.gltf").write_text(json.dumps(header))
     write_usd(tmp_path / "b.usda", box)
-    for outside in ("../b.usda", str(tmp_path / "b.usda")):
-        (tmp_path / "in/c.usda").write_text(
-            f'#usda 1.0\ndef Xform "a" (references = @{outside}@</thing>) {{}}\n'
-        )
-        refused("outside its own folder", read_scan, tmp_path / "in/c.usda", None)
+    for k, outside in enumerate(("../b.usda", tmp_path / "b.usda")):
+        text = f'#usda 1.0\ndef Xform "a" (references = @{outside}@</thing>) {{}}\n'
+        (inside / f"{k}.usda").write_text(text)
+    for file in ("a.obj", "a.gltf", "a.usda", "0.usda", "1.usda"):
+        unit = None if file.endswith("usda") else "m"
+        refused("outside its own folder", read_scan, inside / file, unit)

@@ -379,20 +379,14 @@ def test_a_mesh_that_is_too_large_is_named_before_it_is_read(tmp_path: Path) -> 
     refused("triangles; up to 100", read_object, source, "mug.ply", PoolConfig(most_faces=100))
 
 
-def test_a_pool_that_is_not_there_is_refused() -> None:
+def test_pools_that_cannot_be_opened_say_what_there_is(tmp_path: Path) -> None:
     for text in ("nowhere", "nowhere=2"):
         refused(r"no folder; 'pybullet'", open_pool, [text])
-
-
-def test_a_folder_without_meshes_is_refused_and_says_what_it_holds(tmp_path: Path) -> None:
+    for weight in ("0", "-1", "nan", "inf"):
+        refused("not positive", open_pool, [f"pybullet={weight}"])
     refused(r"no mesh \(it holds nothing\)", open_pool, [str(tmp_path)])
     (tmp_path / "readme.md").write_text("x")
     refused(r"no mesh \(it holds readme.md\)", open_pool, [str(tmp_path)])
-
-
-def test_a_weight_that_is_not_positive_is_refused() -> None:
-    for weight in ("0", "-1", "nan", "inf"):
-        refused("not positive", open_pool, [f"pybullet={weight}"])
 
 
 # --- The ten table models: closed, convex outlines, top at z = 0, feet on the floor.
