@@ -1,6 +1,6 @@
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -49,10 +49,8 @@ class Simulation:
         rng = np.random.default_rng(seed)
         self.board = TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01)
         self.intrinsics0, self.intrinsics = FACTORY, TRUE_LENS
-        self.T_ee_cam = se3.from_rt(
-            se3.exp_so3([0.1, -0.05, 1.5]) @ se3.exp_so3(rng.normal(scale=0.1, size=3)),
-            np.array([0.03, -0.06, 0.05]),
-        )
+        R = se3.exp_so3([0.1, -0.05, 1.5]) @ se3.exp_so3(rng.normal(scale=0.1, size=3))
+        self.T_ee_cam = se3.from_rt(R, [0.03, -0.06, 0.05])
         w, h = self.board.size_m
         down = np.diag([1.0, -1.0, -1.0])
         self.T_base_board = se3.from_rt(down, [0.4 - w / 2, 0.1 + h / 2, 0.02])
@@ -68,19 +66,13 @@ class Simulation:
             ee = T_base_cam @ se3.invert(self.T_ee_cam)
             noise = np.concatenate([rng.normal(scale=rot, size=3), rng.normal(scale=trans, size=3)])
             self.truth_ee.append(ee)
-            self.views.append(
-                BoardView(
-                    index=k,
-                    T_base_ee=ee @ se3.exp(noise),
-                    detection=self.see(T_base_cam, rng, pixel),
-                )
-            )
+            seen = self.see(T_base_cam, rng, pixel)
+            self.views.append(BoardView(index=k, T_base_ee=ee @ se3.exp(noise), detection=seen))
 
     def _upright(self, T_board_cam: Array) -> Array:
         """Return the camera at the same place with the same line of sight, without roll."""
         eye, z = T_board_cam[:3, 3], T_board_cam[:3, 2]
-        x = np.array([1.0, 0.0, 0.0])
-        x = x - z * (x @ z)
+        x = np.array([1.0, 0.0, 0.0]) - z * z[0]
         x = x / np.linalg.norm(x)
         return se3.from_rt(np.stack([x, np.cross(z, x), z], -1), eye)
 
@@ -142,10 +134,8 @@ def record_maps(rng: np.random.Generator) -> tuple[RobotErrorMap | ArmErrorMap |
         frame="base", mean=rng.normal(size=12), sd_m=0.1, weights=rng.normal(size=(6, 12)) * 1e-4,
         reach=rng.normal(size=(9, 12)),
     )  # fmt: skip
-    of_arm = ArmErrorMap(
-        arm=arm, errors=rng.normal(size=24) * 1e-3, T_flange_tool=se3.random_transform(rng)
-    )
-    return pose, None, of_arm
+    errors, tool = rng.normal(size=24) * 1e-3, se3.random_transform(rng)
+    return pose, None, ArmErrorMap(arm=arm, errors=errors, T_flange_tool=tool)
 
 
 def record(
@@ -186,11 +176,6 @@ def record(
         ),
         information=covariance(29, 1.0),
     )  # fmt: skip
-
-
-@pytest.fixture(scope="session")
-def full_record() -> Callable[..., HandEyeReport]:
-    return record
 
 
 # --- calibrations of a simulated arm with errors in its joints and links -------------------------
@@ -235,7 +220,8 @@ def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> lis
     Z = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.45 - w / 2, 0.1 + h / 2, 0.02])
     X = se3.from_rt(se3.exp_so3([0.0, 0.0, 1.5]) @ se3.exp_so3([0.25, 0.03, 0.0]),
                     [0.012, -0.071, 0.043])  # fmt: skip
-    if mode == "eye_to_hand":
+    in_hand = mode == "eye_in_hand"
+    if not in_hand:
         X = se3.look_at([1.2, 0.1, 0.7], [0.5, 0.0, 0.35], 0.0)
         Z = se3.exp([0.1, 0.2, 0.3, -0.1, -0.08, 0.1])
     real = ARM.corrected(rng.normal(size=24) * np.repeat([1e-3, 3e-4], 12))
@@ -243,20 +229,16 @@ def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> lis
     while len(shots) < views:
         T_board_cam = se3.invert(camera_at(rng, board, rng.uniform(0.28, 0.45), 45.0))
         T_board_cam = T_board_cam @ se3.exp([*rng.normal(scale=[0.16, 0.28, 0.0], size=3), 0, 0, 0])
-        T_hand = (
-            Z @ T_board_cam @ se3.invert(X)
-            if mode == "eye_in_hand"
-            else X @ se3.invert(T_board_cam) @ se3.invert(Z)
-        )
+        T_hand = Z @ T_board_cam @ se3.invert(X) if in_hand else X @ se3.invert(Z @ T_board_cam)
         q, told = None, T_hand
         A = T_hand @ se3.exp(rng.normal(scale=3e-4, size=6))
-        if mode == "eye_in_hand":
+        if in_hand:
             q = joints_of(T_hand, rng)
             if q is None:
                 continue
             A = real.forward(q) @ se3.exp(rng.normal(scale=1e-4, size=6))
             told = ARM.forward(q)
-        T = se3.invert(A @ X) @ Z if mode == "eye_in_hand" else se3.invert(X) @ A @ Z
+        T = se3.invert(A @ X) @ Z if in_hand else se3.invert(X) @ A @ Z
         uv = camera.project(TRUE_LENS, se3.transform(T, printed))
         uv = uv + rng.normal(scale=0.12, size=uv.shape)
         inside = np.flatnonzero(np.all((uv > 2) & (uv < [1277, 717]), axis=-1))
@@ -283,8 +265,3 @@ def arm_calibration(
     config = HandEyeConfig(mode=mode, robot_map=with_map)
     shots = arm_views(board, views, mode, with_joints)
     return calibrate_hand_eye_report(shots, board, FACTORY, config, ARM if with_joints else None)
-
-
-@pytest.fixture(scope="session")
-def calibrated_arm() -> Callable[..., HandEyeReport]:
-    return arm_calibration

@@ -5,7 +5,6 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,9 +37,8 @@ from realsim_calibration.report.view_plots import plot_views
 from realsim_calibration.results import HandEyeReport, Mode
 from realsim_calibration.views import detection_of
 from refusals import refused
-from tests.calibration.conftest import TRUE_LENS
+from tests.calibration.conftest import TRUE_LENS, arm_calibration
 
-Maker = Callable[..., HandEyeReport]
 HOSTILE = "<script>alert('$x^2$ & _y_')</script>.png"
 ODD_NAME = "图像 \u202e\n\t$" + "x" * 200
 CHECKS = (
@@ -60,9 +58,9 @@ CHECKS = (
 
 
 @pytest.fixture(scope="module")
-def report(calibrated_arm: Maker) -> HandEyeReport:
+def report() -> HandEyeReport:
     """Return a real calibration, with some checks of every verdict added to its own."""
-    found = calibrated_arm()
+    found = arm_calibration()
     return replace(found, checks=(*found.checks, *CHECKS))
 
 
@@ -123,10 +121,8 @@ def test_the_page_says_the_figures(report: HandEyeReport, paths: list[Path]) -> 
     ):
         assert text in shown
     # The verdict comes before the checks, these before the pictures.
-    order = [
-        shown.index(t) for t in (verdict(report).headline, "Measure the board", "Where the camera")
-    ]
-    assert order == sorted(order)
+    parts = (verdict(report).headline, "Measure the board", "Where the camera")
+    assert sorted(parts, key=shown.index) == list(parts)
 
 
 @pytest.mark.parametrize(
@@ -189,10 +185,8 @@ def test_a_report_of_dropped_views_is_written(report: HandEyeReport, tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_camera_beside_the_robot_with_lens_and_depth(
-    calibrated_arm: Maker, tmp_path: Path
-) -> None:
-    report = calibrated_arm(16, "eye_to_hand", with_map=False)
+def test_a_camera_beside_the_robot_with_lens_and_depth(tmp_path: Path) -> None:
+    report = arm_calibration(16, "eye_to_hand", with_map=False)
     detections = [detection_of(report.target, v.uv, (1280, 720), v.point_ids) for v in report.used]
     lens = calibrate_intrinsics(detections, report.target)
     warned = Check(name="depth", verdict="warn", sentence="3 of the views <lie>.")
@@ -211,8 +205,8 @@ def test_a_camera_beside_the_robot_with_lens_and_depth(
 
 
 @pytest.fixture(scope="module")
-def plain_report(calibrated_arm: Maker) -> HandEyeReport:
-    return calibrated_arm()
+def plain_report() -> HandEyeReport:
+    return arm_calibration()
 
 
 @pytest.mark.parametrize(
@@ -223,11 +217,9 @@ def test_viewpoint_of_a_known_camera(
     plain_report: HandEyeReport, mode: Mode, tilt: float, azimuth: float, roll: float
 ) -> None:
     t, a, r = np.radians([tilt, azimuth, roll])
-    w, h = plain_report.target.size_m
-    middle = np.array([w / 2, h / 2, 0])
+    middle = np.array([*plain_report.target.size_m, 0]) / 2
     # A camera that looks straight down on the page, tilted about the target's middle, then rolled.
-    lean = se3.exp_so3(t * np.array([-np.sin(a), np.cos(a), 0]))
-    R = lean.T @ se3.exp_so3([0, 0, -r])
+    R = se3.exp_so3(t * np.array([-np.sin(a), np.cos(a), 0])).T @ se3.exp_so3([0, 0, -r])
     T_board_cam = se3.from_rt(R, middle - 0.4 * R[:, 2])
     A = plain_report.Z @ T_board_cam @ se3.invert(plain_report.X)
     if mode == "eye_to_hand":
@@ -244,9 +236,9 @@ def test_viewpoint_of_a_known_camera(
         assert np.cos(np.radians(p.azimuth_deg) - a) == pytest.approx(1, abs=1e-9)
 
 
-def test_the_arms_map_explains_most_of_the_error(calibrated_arm: Maker) -> None:
+def test_the_arms_map_explains_most_of_the_error() -> None:
     """Errors of a milliradian per joint: what the solver's map leaves is a fraction of them."""
-    plain_report = calibrated_arm(with_joints=True)
+    plain_report = arm_calibration(with_joints=True)
     assert isinstance(plain_report.robot_map, ArmErrorMap) and plain_report.map_name == "arm"
     rests = [rest_of_map(plain_report, v) for v in plain_report.used]
     left = np.array([r for r in rests if r is not None])
@@ -259,8 +251,8 @@ def test_the_arms_map_explains_most_of_the_error(calibrated_arm: Maker) -> None:
     assert np.array_equal(corrected(plain_report, unknown), unknown.T_base_ee)
 
 
-def test_camera_poses_of_an_arm_s_calibration_need_joints(calibrated_arm: Maker) -> None:
-    plain_report = calibrated_arm(with_joints=True)
+def test_camera_poses_of_an_arm_s_calibration_need_joints() -> None:
+    plain_report = arm_calibration(with_joints=True)
     hand_eye = plain_report.hand_eye
     assert isinstance(hand_eye, HandEye)
     view = plain_report.used[0]

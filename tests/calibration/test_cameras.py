@@ -90,20 +90,17 @@ def lab(
         for b, board in enumerate(boards):
             place = {"table": Z_TABLE, "hand": hand @ Z_HELD, "free": by_hand}[board.place]
             for c, name in enumerate(names):
-                eye = hand @ PLACES[name] if name == "wrist" else PLACES[name]
-                T = se3.invert(eye) @ place
+                T = se3.invert(hand @ PLACES[name] if name == "wrist" else PLACES[name]) @ place
                 points = board.target.points_board
                 noise = rng.normal(scale=pixel, size=(len(points), 2))
                 p = se3.transform(T, points)
                 if p[:, 2].min() < 0.1 or T[2, 2] < 0.3:
                     continue
                 uv = project(LENS, p) + noise
-                seen = np.all((uv > 1) & (uv < [1278, 958]), -1)
-                if seen.sum() < 12:
+                seen = np.flatnonzero(np.all((uv > 1) & (uv < [1278, 958]), -1))
+                if len(seen) < 12:
                     continue
-                found = TargetDetection(
-                    point_ids=np.flatnonzero(seen), uv=uv[seen], image_size=(1280, 960)
-                )
+                found = TargetDetection(point_ids=seen, uv=uv[seen], image_size=(1280, 960))
                 sightings.append(Sighting(camera=c, board=b, instant=i, detection=found))
     return Rig(
         cameras=tuple(
@@ -154,8 +151,7 @@ def test_the_covariance_of_all_holds_each_and_the_pairs() -> None:
         at = slice(6 * c, 6 * c + 6)
         assert np.allclose(report.covariance[at, at], own.X_covariance)
     pair = next(p for p in report.pairs if p.names == ("left", "right"))
-    truth = se3.invert(PLACES["left"]) @ PLACES["right"]
-    assert chi2(truth, pair.T_a_b, pair.covariance) < 22.5
+    assert chi2(se3.invert(PLACES["left"]) @ PLACES["right"], pair.T_a_b, pair.covariance) < 22.5
     assert pair.together == VIEWS
     # A view of a few tenths of a pixel is good, however good the others are.
     assert report.disagreeing(0.5, 0.0) and min(v.unseen_px for v in report.disagreeing(0.5)) > 0.3
@@ -163,17 +159,15 @@ def test_the_covariance_of_all_holds_each_and_the_pairs() -> None:
 
 def test_the_step_is_that_of_all_unknowns_solved_at_once() -> None:
     """Elimination against one dense least-squares problem of the same rows."""
-    rig = lab(views=6, moved=True, names=("wrist", "left", "right"))
+    rig = lab(views=6, moved=True)
     loose = {(0, i): PLACES["left"] @ T for i, T in _boards_by(rig, 1).items()}
     rig = rig.only([s for s in rig.sightings if (0, s.instant) in loose])
     problem = RigProblem(
         rig, [FACTORY] * 3, [JointConfig()] * 3, np.ones(len(rig.instants), dtype=bool)
     )
     A = np.stack([t.T_base_ee for t in rig.instants if t.T_base_ee is not None])
-    state = first_state(
-        np.stack([PLACES[n] for n in ("wrist", "left", "right")]), np.eye(4)[None],
-        [FACTORY] * 3, A, loose,
-    )  # fmt: skip
+    eyes = np.stack([PLACES[n] for n in ("wrist", "left", "right")])
+    state = first_state(eyes, np.eye(4)[None], [FACTORY] * 3, A, loose)
     sigmas, ratio = np.full(3, 0.3), np.array([0.4, 0.7])
     model = RigModel(problem, state, sigmas, problem.ones())
     step = model.fit(None, ratio, 1.0, rounds=0).step
@@ -275,8 +269,7 @@ def blind(rig: Rig) -> Rig:
 
 
 def swapped_cameras(rig: Rig) -> Rig:
-    mounts = {0: 1, 1: 0, 2: 2}
-    return rig.only([replace(s, camera=mounts[s.camera]) for s in rig.sightings])
+    return rig.only([replace(s, camera={0: 1, 1: 0, 2: 2}[s.camera]) for s in rig.sightings])
 
 
 def one_mounted_otherwise(rig: Rig) -> Rig:
@@ -297,12 +290,15 @@ def same_boards(rig: Rig) -> Rig:
     return replace(rig, boards=(rig.boards[0], replace(rig.boards[1], target=TABLE)))
 
 
+def one_right_view(rig: Rig) -> Rig:
+    first = next(s for s in rig.sightings if s.camera == 2)
+    return rig.only([s for s in rig.sightings if s.camera != 2 or s is first])
+
+
 def lone_camera(rig: Rig) -> Rig:
     """The right camera has one view only, and no intrinsics."""
-    first = next(s for s in rig.sightings if s.camera == 2)
     cameras = (*rig.cameras[:2], replace(rig.cameras[2], intrinsics0=None))
-    kept = [s for s in rig.sightings if s.camera != 2 or s is first]
-    return replace(rig.only(kept), cameras=cameras)
+    return replace(one_right_view(rig), cameras=cameras)
 
 
 def other_size(rig: Rig) -> Rig:
@@ -359,11 +355,7 @@ def test_images_of_two_cameras_exchanged_at_one_instant() -> None:
 
 
 def test_one_view_of_a_known_lens_is_enough_and_said() -> None:
-    rig = lab()
-    first = next(s for s in rig.sightings if s.camera == 2)
-    report = calibrate_cameras(
-        rig.only([s for s in rig.sightings if s.camera != 2 or s is first]), PLAIN
-    )
+    report = calibrate_cameras(one_right_view(lab()), PLAIN)
     assert place_mm(report, "right") < 5.0
     assert misfit(report, "right") < 22.5
     few = [c for c in report.checks if c.name == "few views"]

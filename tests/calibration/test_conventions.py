@@ -32,6 +32,11 @@ def session(seed, **kind):
     return faults.draw_session(np.random.default_rng(seed), **kind)
 
 
+def grown(T, factor):
+    """Return poses whose lengths are `factor` times as large."""
+    return se3.from_rt(T[:, :3, :3], factor * T[:, :3, 3])
+
+
 # Laws
 
 
@@ -58,14 +63,12 @@ def test_the_reading_that_a_remedy_names_decodes_like_its_convention():
 
 
 def test_euler_conventions_are_those_of_the_textbook():
-    a, b, c = 0.3, -0.7, 1.1
-    Rx, Ry, Rz = (se3.exp_so3(np.eye(3)[k] * v) for k, v in enumerate((a, b, c)))
-    decode = {
-        n: conv.decode(np.array([a, b, c])) for n, conv in CONVENTIONS.items() if "uat" not in n
-    }
-    assert np.allclose(decode["Euler XYZ (moving axes)"], Rx @ Ry @ Rz)
-    assert np.allclose(decode["Euler xyz (fixed axes)"], Rz @ Ry @ Rx)
-    assert np.allclose(decode["rx ry rz as the product Ry Rz Rx"], Ry @ Rz @ Rx)
+    angles = np.array([0.3, -0.7, 1.1])
+    Rx, Ry, Rz = se3.exp_so3(np.diag(angles))
+    assert np.allclose(CONVENTIONS["Euler XYZ (moving axes)"].decode(angles), Rx @ Ry @ Rz)
+    assert np.allclose(CONVENTIONS["Euler xyz (fixed axes)"].decode(angles), Rz @ Ry @ Rx)
+    product = CONVENTIONS["rx ry rz as the product Ry Rz Rx"]
+    assert np.allclose(product.decode(angles), Ry @ Rz @ Rx)
 
 
 @pytest.mark.parametrize("eye_in_hand", [True, False])
@@ -159,18 +162,14 @@ def test_a_shuffled_list_is_unknown_with_figures():
 
 def test_a_small_print_error_is_a_scale_and_not_a_fault():
     s = session(7)
-    C = s.C.copy()
-    C[:, :3, 3] *= 1.02
-    d = faults.ask(replace(s, C=C, nominal=None))
+    d = faults.ask(replace(s, C=grown(s.C, 1.02), nominal=None))
     assert d.fault == "none" and d.length_ratio == pytest.approx(1 / 1.02, rel=0.01)
 
 
 def test_a_square_ten_percent_too_large_is_refused_with_the_size_to_give():
     s = session(7)
     large = replace(faults.BOARD, square_m=1.1 * faults.BOARD.square_m)
-    C = s.C.copy()
-    C[:, :3, 3] *= 1.1
-    d = faults.ask(replace(s, C=C, target=large, nominal=None))
+    d = faults.ask(replace(s, C=grown(s.C, 1.1), target=large, nominal=None))
     assert d.fault == "board_size", d.sentence
     size = float(re.search(r"square is ([\d.]+) mm, not 22 mm", d.sentence)[1])
     assert size == pytest.approx(20.0, rel=0.01)
@@ -291,14 +290,10 @@ def test_a_mirror_twin_stands_in():
     s = session(4, views=(20, 20))
     C, twins = s.C.copy(), [None] * 20
     twins[7] = C[7].copy()
-    C[7] = C[7] @ turn_about_middle([0.6, 0.0, 0.0])
+    R = se3.exp_so3([0.6, 0.0, 0.0])
+    C[7] = C[7] @ se3.from_rt(R, MIDDLE - R @ MIDDLE)
     chosen, dropped, used = frame_gate(s.T, C, twins, MIDDLE, eye_in_hand=s.eye_in_hand)
     assert used == [7] and not dropped and np.array_equal(chosen, s.C)
-
-
-def turn_about_middle(w):
-    R = se3.exp_so3(w)
-    return se3.from_rt(R, MIDDLE - R @ MIDDLE)
 
 
 def test_the_frame_gate_keeps_clean_views():
@@ -366,12 +361,11 @@ real = pytest.mark.skipif(not KOCH.is_dir(), reason=f"no real data at {KOCH} (se
 @pytest.fixture(scope="module")
 def koch():
     meta = json.loads((KOCH / "meta.json").read_text())
-    stacks = []
-    for key in ("robot_poses", "cam_poses"):
-        T = np.array(meta[key]).reshape(-1, 4, 4)
-        T[:, :3, 3] /= 1000.0
-        stacks.append(se3.check_rigid(T, key))
-    return stacks[0], stacks[1], np.radians(meta["joints"])
+    A, C = (
+        se3.check_rigid(grown(np.array(meta[key]).reshape(-1, 4, 4), 1e-3), key)
+        for key in ("robot_poses", "cam_poses")
+    )
+    return A, C, np.radians(meta["joints"])
 
 
 @real
@@ -388,7 +382,5 @@ def test_a_real_ur5_is_sound_and_its_tool_is_named(koch):
 @pytest.mark.real
 def test_millimetres_of_a_real_file_are_named(koch):
     A, C, _ = koch
-    raw = A.copy()
-    raw[:, :3, 3] *= 1000
-    d = diagnose(raw, C)
+    d = diagnose(grown(A, 1000), C)
     assert d.fault == "robot_unit" and np.allclose(d.repaired_base_ee, A)

@@ -86,9 +86,7 @@ def test_a_focal_length_error_is_within_its_sigma() -> None:
     wrong = replace(CAMERA, fx=CAMERA.fx * 1.003, fy=CAMERA.fy * 1.003)
     C = np.zeros((12, 12))
     C[:2, :2] = np.outer([CAMERA.fx, CAMERA.fy], [CAMERA.fx, CAMERA.fy]) * 0.003**2
-    report = estimate_depth_bias(
-        views, BOARD, wrong, replace(EXACT, board_scale_sd=0.0), intrinsics_covariance=C
-    )
+    report = estimate_depth_bias(views, BOARD, wrong, EXACT, intrinsics_covariance=C)
     error = np.array([report.bias.scale - 1, report.bias.offset_per_m])
     sd = np.sqrt(np.diag(report.board_covariance))
     assert abs(error[0]) == pytest.approx(sd[0], rel=0.15)  # one sigma was applied
@@ -157,8 +155,7 @@ def test_a_bad_view_does_not_bend_the_result() -> None:
     report = run([*views[:4], spoiled, *views[5:]])
     sd = np.sqrt(np.diag(report.bias.covariance))
     assert abs(report.bias.scale - clean.bias.scale) < 2 * sd[0]
-    worst = max(report.views, key=lambda v: abs(v.unseen_m / v.distance_m))
-    assert worst.index == 4
+    assert max(report.views, key=lambda v: abs(v.unseen_m / v.distance_m)).index == 4
 
 
 # ---- refusals
@@ -176,8 +173,7 @@ def test_one_distance_gives_only_the_sum() -> None:
 
 
 def test_a_wrong_unit_is_named() -> None:
-    views = views_of(DepthBias.none())
-    tenfold = [replace(v, depth_m=v.depth_m * np.float32(10.0)) for v in views]
+    tenfold = [replace(v, depth_m=v.depth_m * np.float32(10.0)) for v in views_of(DepthBias.none())]
     refused(r"0\.001.*0\.0001", run, tenfold, error=UnitError)
 
 

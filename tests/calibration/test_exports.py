@@ -6,7 +6,6 @@ import math
 import shlex
 import subprocess
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +29,9 @@ from realsim_calibration.exports.frames import FrameNames, note_lines, published
 from realsim_calibration.exports.write import opencv_text, write_exports
 from realsim_calibration.results import HandEyeReport, Mode
 from refusals import refused
+from tests.calibration.conftest import record
 from tried_grasps import assert_same
 
-EXACT = 1e-9
-Maker = Callable[..., HandEyeReport]
 axis = hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(
     lambda v: np.linalg.norm(v) > 1e-3
 )
@@ -77,14 +75,12 @@ def yaml11(text: str) -> Any:
 
 
 def same(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    return bool(np.abs(a - b).max() < EXACT)
+    return bool(np.abs(a - b).max() < 1e-9)
 
 
 FRAMES = FrameNames(robot_base="base", hand="tool0", camera_optical="cam_optical", name="ur5")
-LINK = FrameNames(
-    camera_link="camera_link", T_link_optical=se3.from_rt(FRAMES.T_link_optical[:3, :3],
-    [0.0, 0.015, 0.001]),
-)  # fmt: skip
+ASIDE = se3.from_rt(FRAMES.T_link_optical[:3, :3], [0.0, 0.015, 0.001])
+LINK = FrameNames(camera_link="camera_link", T_link_optical=ASIDE)
 
 
 # --- laws ---------------------------------------------------------------------------------------
@@ -92,8 +88,8 @@ LINK = FrameNames(
 
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
 @settings(max_examples=15, deadline=None)
-def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
-    report = full_record(X, mode)
+def test_easy_handeye_reads_the_same_transform(X: Array, mode: Mode) -> None:
+    report = record(X, mode)
     two = yaml11(write.easy_handeye2_text(report, FRAMES))
     t, q = two["transform"]["translation"], two["transform"]["rotation"]
     assert all(type(v) is float for v in (*t.values(), *q.values()))
@@ -105,10 +101,8 @@ def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mod
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
 @settings(max_examples=15, deadline=None)
-def test_ros_commands_and_launch_carry_the_same_transform(
-    full_record: Maker, X: Array, frames: FrameNames
-) -> None:
-    report = full_record(X)
+def test_ros_commands_and_launch_carry_the_same_transform(X: Array, frames: FrameNames) -> None:
+    report = record(X)
     expected, parent, child = published_transform(report, frames)
     words = shlex.split(write.ros2_command(report, frames))
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
@@ -128,9 +122,9 @@ def test_ros_commands_and_launch_carry_the_same_transform(
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
 @settings(max_examples=15, deadline=None)
-def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: FrameNames) -> None:
+def test_urdf_reads_the_same_transform(X: Array, frames: FrameNames) -> None:
     """rpy about fixed axes: R = Rz Ry Rx, read with this formula and compared."""
-    root = ET.fromstring(write.urdf_text(full_record(X), frames))
+    root = ET.fromstring(write.urdf_text(record(X), frames))
     T = np.eye(4)
     links = [link.attrib["name"] for link in root.findall("link")]
     for joint in root.findall("joint"):
@@ -147,8 +141,8 @@ def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: Fra
 
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
 @settings(max_examples=15, deadline=None)
-def test_opencv_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
-    report = full_record(X, mode)
+def test_opencv_reads_the_same_transform(X: Array, mode: Mode) -> None:
+    report = record(X, mode)
     text = opencv_text(report, FRAMES)
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     at, target = ("gripper", "base") if mode == "eye_in_hand" else ("base", "gripper")
@@ -164,9 +158,9 @@ def test_opencv_reads_the_same_transform(full_record: Maker, X: Array, mode: Mod
 # --- known answers ------------------------------------------------------------------------------
 
 
-def test_camera_link_of_a_camera_that_looks_along_the_tool(full_record: Maker) -> None:
+def test_camera_link_of_a_camera_that_looks_along_the_tool() -> None:
     """Optical = tool axes, 0.1 m ahead: the body's x axis is then the tool's z axis."""
-    report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
+    report = record(se3.from_translation([0.0, 0.0, 0.1]))
     T, parent, child = published_transform(report, FrameNames(camera_link="camera_link"))
     assert (parent, child) == ("tool0", "camera_link")
     np.testing.assert_allclose(T[:3, 0], [0, 0, 1], atol=1e-15)  # forward
@@ -175,9 +169,9 @@ def test_camera_link_of_a_camera_that_looks_along_the_tool(full_record: Maker) -
     np.testing.assert_allclose(T[:3, 3], [0, 0, 0.1], atol=1e-15)
 
 
-def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Maker) -> None:
+def test_easy_handeye2_has_the_keys_of_its_message_and_no_others() -> None:
     """set_message_fields refuses unknown keys, so the layout must be the message's own."""
-    read = yaml11(write.easy_handeye2_text(full_record(np.eye(4), "eye_to_hand"), FRAMES))
+    read = yaml11(write.easy_handeye2_text(record(np.eye(4), "eye_to_hand"), FRAMES))
     assert list(read) == ["parameters", "transform"]
     assert read["parameters"] == {
         "name": "ur5",
@@ -190,12 +184,12 @@ def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Ma
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    old = yaml11(write.easy_handeye_text(full_record(np.eye(4)), FRAMES))
+    old = yaml11(write.easy_handeye_text(record(np.eye(4)), FRAMES))
     assert old["parameters"]["eye_on_hand"] is True and old["parameters"]["namespace"] == "/ur5/"
 
 
-def test_every_text_says_frames_units_accuracy_and_warnings(full_record: Maker) -> None:
-    report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
+def test_every_text_says_frames_units_accuracy_and_warnings() -> None:
+    report = record(se3.from_translation([0.0, 0.0, 0.1]))
     notes = "\n".join(note_lines(report, FRAMES))
     for text in (
         write.easy_handeye2_text(report, FRAMES),
@@ -211,25 +205,21 @@ def test_every_text_says_frames_units_accuracy_and_warnings(full_record: Maker) 
     assert "alert(1)" in notes and all("\n" not in n for n in note_lines(report, FRAMES))
 
 
-def test_the_shell_scripts_run_one_command_with_the_words(
-    full_record: Maker, tmp_path: Path
-) -> None:
+def test_the_shell_scripts_run_one_command_with_the_words(tmp_path: Path) -> None:
     """A shell runs the script with a `ros2` that prints its arguments: comments stay comments."""
     fake = tmp_path / "ros2"
     fake.write_text('#!/bin/sh\nfor w in "$@"; do echo "$w"; done\n')
     fake.chmod(0o755)
-    report = full_record(se3.from_translation([0.1, -0.2, 1e-17]))
+    report = record(se3.from_translation([0.1, -0.2, 1e-17]))
     script = tmp_path / "publish.sh"
     script.write_text(write.ros2_script(report, FRAMES))
-    ran = subprocess.run(
-        ["/bin/sh", str(script)], env={"PATH": f"{tmp_path}:/bin:/usr/bin"}, capture_output=True,
-        text=True, check=True,
-    )  # fmt: skip
-    assert ran.stdout.split() == shlex.split(write.ros2_command(report, FRAMES))[1:]
+    env = {"PATH": f"{tmp_path}:/bin:/usr/bin"}
+    said = subprocess.check_output(["/bin/sh", str(script)], env=env, text=True)
+    assert said.split() == shlex.split(write.ros2_command(report, FRAMES))[1:]
 
 
-def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path) -> None:
-    report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
+def test_write_exports_writes_readable_files(tmp_path: Path) -> None:
+    report = record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
     paths = [*write_exports(report, tmp_path / "out", frames=FRAMES), tmp_path / "out/SHA256SUMS"]
     assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
     on_disk = {p for p in (tmp_path / "out").rglob("*") if p.is_file()}
@@ -243,12 +233,10 @@ def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path)
     assert np.abs(read_calibration(paths[0]).X - report.X).max() < 1e-12
 
 
-def test_edited_files_are_kept_beside_those_of_the_next_run(
-    full_record: Maker, tmp_path: Path
-) -> None:
+def test_edited_files_are_kept_beside_those_of_the_next_run(tmp_path: Path) -> None:
     told: list[str] = []
     for k, edit in enumerate(("", "by hand", "anew", "")):
-        report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06 + 0.01 * k]))
+        report = record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06 + 0.01 * k]))
         write_exports(report, tmp_path, frames=FRAMES, tell=told.append)
         if edit:
             (tmp_path / "camera.urdf").write_text(edit)
@@ -269,9 +257,9 @@ def test_frame_names_that_tf_refuses(wrong: dict[str, Any]) -> None:
     refused(".", FrameNames, **wrong)
 
 
-def test_the_base_is_no_hand_that_carries_a_camera(full_record: Maker, tmp_path: Path) -> None:
+def test_the_base_is_no_hand_that_carries_a_camera(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="robot_base and hand have the same name: 'base'"):
-        write_exports(full_record(np.eye(4)), tmp_path / "out", frames=FrameNames(hand="base"))
+        write_exports(record(np.eye(4)), tmp_path / "out", frames=FrameNames(hand="base"))
     assert not list(tmp_path.rglob("*.*"))
 
 
@@ -291,14 +279,10 @@ TARGETS: tuple[Target, ...] = (
 )
 @settings(max_examples=12, deadline=None)
 def test_json_round_trip_is_exact(
-    full_record: Maker,
-    twist: tuple[float, ...],
-    seed: int,
-    target: Target,
-    tmp_path_factory: pytest.TempPathFactory,
+    twist: tuple[float, ...], seed: int, target: Target, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     mode: Mode = "eye_in_hand" if seed % 2 else "eye_to_hand"
-    report = full_record(se3.exp(twist), mode, target, seed)
+    report = record(se3.exp(twist), mode, target, seed)
     path = tmp_path_factory.mktemp("json") / "calibration.json"
     path.write_text(calibration_text(report, FRAMES), encoding="utf-8")
     again = read_calibration(path)
@@ -341,11 +325,9 @@ def damaged(report: HandEyeReport, key: str, value: Any) -> str:
         ("map_scores", [["none"]], "map_scores"),
     ],
 )
-def test_a_damaged_entry_is_named(
-    full_record: Maker, key: str, value: Any, says: str, tmp_path: Path
-) -> None:
+def test_a_damaged_entry_is_named(key: str, value: Any, says: str, tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
-    path.write_text(damaged(full_record(np.eye(4)), key, value))
+    path.write_text(damaged(record(np.eye(4)), key, value))
     assert says in refused(r"calibration\.json", read_calibration, path)
 
 

@@ -6,15 +6,11 @@ import pytest
 from realsim.errors import DegenerateError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim_calibration import CLOSED_FORMS, JointConfig, check_observable, park
+from realsim_calibration import CLOSED_FORMS, HandEyeConfig, JointConfig, check_observable, park
 from realsim_calibration.checks import own_lens_check
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.fit.board_pose import estimate_board_pose
-from realsim_calibration.hand_eye import (
-    HandEyeConfig,
-    calibrate_hand_eye,
-    calibrate_hand_eye_report,
-)
+from realsim_calibration.hand_eye import calibrate_hand_eye, calibrate_hand_eye_report
 from realsim_calibration.views import BoardView
 from refusals import refused
 
@@ -99,8 +95,7 @@ def test_one_step_leave_one_out_matches_a_refit(simulate):
         T = se3.invert(view.T_base_ee @ refit.X) @ refit.Z
         uv = project(refit.intrinsics, se3.transform(T, middle + board.scale * local))
         exact.append(np.sqrt(np.mean(np.sum((uv - view.detection.uv) ** 2, -1))))
-    exact_rms = np.sqrt(np.mean(np.square(exact)))
-    assert 0.8 < report.hand_eye.held_out_px / exact_rms < 1.25
+    assert 0.8 < report.hand_eye.held_out_px / np.sqrt(np.mean(np.square(exact))) < 1.25
     assert report.hand_eye.held_out_px > np.sqrt(np.mean(report.hand_eye.view_rms_px**2))
 
 
@@ -151,11 +146,10 @@ def test_a_shifted_pairing_is_told(simulate):
 
 def test_millimetres_and_a_wrong_board_are_told(simulate):
     sim = simulate(9)
-    views = []
-    for v in sim.views:
-        T = v.T_base_ee.copy()
-        T[:3, 3] *= 1000
-        views.append(replace(v, T_base_ee=T))
+    views = [
+        replace(v, T_base_ee=se3.from_rt(v.T_base_ee[:3, :3], 1000 * v.T_base_ee[:3, 3]))
+        for v in sim.views
+    ]
     refused("hand poses are in millimetres", calibrate, sim, views, error=UnitError)
     double = replace(sim.board, tag_size_m=0.06, gap_m=0.02)
     with pytest.raises(UnitError, match=r"tag's edge is (29|30)\.\d+ mm, not 60 mm"):
@@ -192,10 +186,8 @@ def _args(sim):
 
 def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
     sim = simulate(2, views=10)
-    blind = replace(
-        sim.views[4],
-        detection=sim.views[4].detection.__class__(point_ids=[], uv=[], image_size=(1280, 720)),
-    )
+    nothing = replace(sim.views[4].detection, point_ids=[], uv=[])
+    blind = replace(sim.views[4], detection=nothing)
     h = calibrate(sim, [*sim.views[:4], blind, *sim.views[5:]])
     assert h.rejected[0][0] == 4
     advice = next(c.advice for c in h.checks if c.name == "views")
@@ -232,9 +224,7 @@ def problem(seed, n=10, rot=0.0, trans=0.0):
     C = se3.from_rt(se3.exp_so3(rng.normal(scale=0.5, size=(n, 3))), rng.normal(size=(n, 3)))
     C[:, 2, 3] += 1.0
     A = Z @ se3.invert(C) @ se3.invert(X)
-    noise = np.concatenate(
-        [rng.normal(scale=rot, size=(n, 3)), rng.normal(scale=trans, size=(n, 3))], -1
-    )
+    noise = np.concatenate([rng.normal(scale=s, size=(n, 3)) for s in (rot, trans)], -1)
     return A @ se3.exp(noise), C, X, Z
 
 

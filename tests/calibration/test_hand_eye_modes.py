@@ -80,11 +80,10 @@ def test_boards_counted_from_the_wrong_end_are_mended(simulate):
         T = se3.invert(ee @ sim.T_ee_cam) @ sim.T_base_board
         views.append(replace(v, detection=seen_from(sim, T, target)))
     plain = calibrate_hand_eye_report(views, target, sim.intrinsics0)
-    flipped = []
-    for k, v in enumerate(views):
-        d = v.detection
-        turned = replace(d, point_ids=47 - d.point_ids) if k in (2, 5, 9) else d
-        flipped.append(replace(v, detection=turned))
+    flipped = list(views)
+    for k in (2, 5, 9):
+        d = views[k].detection
+        flipped[k] = replace(views[k], detection=replace(d, point_ids=47 - d.point_ids))
     mended = calibrate_hand_eye_report(flipped, target, sim.intrinsics0)
     assert np.allclose(mended.X, plain.X, atol=1e-9)
     check = next(c for c in mended.checks if c.name == "half turns")
@@ -202,25 +201,22 @@ def test_terms_that_the_lens_refused_cannot_fold_the_image(simulate):
     sim = simulate(2, views=12)
     views = []
     for v in sim.views:
-        near = np.linalg.norm(v.detection.uv - [640.0, 360.0], axis=1) < 260
         d = v.detection
-        part = TargetDetection(point_ids=d.point_ids[near], uv=d.uv[near], image_size=d.image_size)
-        views.append(replace(v, detection=part))
+        near = np.linalg.norm(d.uv - [640.0, 360.0], axis=1) < 260
+        views.append(replace(v, detection=replace(d, point_ids=d.point_ids[near], uv=d.uv[near])))
     result = calibrate(views, sim.board)
     assert result.lens is not None and "k3" not in result.lens.terms
-    camera = result.hand_eye.intrinsics
     corner = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 719.0], [1279.0, 719.0]])
-    _, valid = undistort(camera, corner)
+    _, valid = undistort(result.hand_eye.intrinsics, corner)
     assert valid.all()
 
 
 def test_joints_of_another_arm_are_named(simulate):
     sim = simulate(1, views=12)
     views = [replace(v, joints=np.zeros(6)) for v in sim.views]
+    panda = find_arm("panda").chain.bare()
     with pytest.raises(InputError, match="6 joint angles, and a Panda has 7"):
-        calibrate_hand_eye_report(
-            views, sim.board, sim.intrinsics0, arm=find_arm("panda").chain.bare()
-        )
+        calibrate_hand_eye_report(views, sim.board, sim.intrinsics0, arm=panda)
 
 
 def test_matrices_that_a_controller_rounded_are_taken(simulate):
@@ -229,9 +225,8 @@ def test_matrices_that_a_controller_rounded_are_taken(simulate):
     C = np.array([se3.invert(v.T_base_ee @ sim.T_ee_cam) @ sim.T_base_board for v in sim.views])
     A = np.array([v.T_base_ee for v in sim.views])
     rounded = np.round(A, 4)  # R^T R is off by up to 1e-4
-    assert (
-        np.abs(np.swapaxes(rounded, 1, 2)[:, :3, :3] @ rounded[:, :3, :3] - np.eye(3)).max() > 2e-5
-    )
+    R = rounded[:, :3, :3]
+    assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() > 2e-5
     exact, close = calibrate_from_poses(A, C), calibrate_from_poses(rounded, np.round(C, 4))
     assert np.abs(se3.log(se3.invert(exact.X) @ close.X)).max() < 2e-4
     view = replace(sim.views[0], T_base_ee=rounded[0])
@@ -253,8 +248,7 @@ def shots() -> tuple[BoardView, ...]:
     Ts = np.array([v.T_base_ee for v in views])
     weights = np.random.default_rng(3).normal(size=(6, 12)) * 6e-4
     errors = pose_features(Ts)[0] @ weights.T
-    told = Ts @ se3.exp(errors)
-    return tuple(replace(v, T_base_ee=T) for v, T in zip(views, told, strict=True))
+    return tuple(replace(v, T_base_ee=T) for v, T in zip(views, Ts @ se3.exp(errors), strict=True))
 
 
 @cache
@@ -308,9 +302,8 @@ def test_the_absolute_sigma_is_nowhere_the_smaller_one(share: float) -> None:
     whole = np.eye(9)
     whole[:6, :6] = A
     lifted = at_least(whole, share * A)
-    assert np.allclose(lifted[:6, :6], max(share, 1.0) * A) and np.array_equal(
-        lifted[6:], whole[6:]
-    )
+    assert np.allclose(lifted[:6, :6], max(share, 1.0) * A)
+    assert np.array_equal(lifted[6:], whole[6:])
     lifted = at_least(whole, H)[:6, :6]
     assert min(np.linalg.eigvalsh(lifted - A)[0], np.linalg.eigvalsh(lifted - H)[0]) > -1e-9
 
@@ -351,9 +344,8 @@ def test_x_without_a_map_is_the_best_on_unseen_views_and_files_say_so(tmp_path: 
 def test_a_closed_form_that_predicts_better_is_taken() -> None:
     """Where the joint fits fail on unseen views, the best closed form is exported."""
     solution, screened = solved()
-    worse = [replace(fit, held_out_px=1e3) for fit in solution.plain]
-    solution = replace(solution, plain=tuple(worse))
-    plain = choose_plain(solution, screened, FACTORY)
+    worse = tuple(replace(fit, held_out_px=1e3) for fit in solution.plain)
+    plain = choose_plain(replace(solution, plain=worse), screened, FACTORY)
     scores = dict(plain.scores)
     assert plain.name in CLOSED_FORMS and scores[plain.name] == min(scores.values())
     assert dict(screened.starts)[plain.name] <= scores[plain.name]

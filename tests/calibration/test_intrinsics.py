@@ -26,6 +26,7 @@ LENS = CameraIntrinsics(
 )  # fmt: skip
 BOARD = Chessboard(rows=6, columns=8, square_m=0.025)
 FOUR = IntrinsicsConfig(models=("k1 k2 p1 p2",))
+TRUTH = camera_vector(LENS)
 
 
 def half_extent(board):
@@ -92,9 +93,8 @@ def test_derivatives_are_those_of_the_cost():
     )
     rng = np.random.default_rng(0)
     poses = np.stack([board_pose(rng, lens, 45.0, 0.8, (0.3, 0.6)) for _ in seen])
-    state = State(
-        camera=camera_vector(lens), board=np.array([0.002, 0.01, -0.02, 0.005]), poses=poses
-    )
+    board = np.array([0.002, 0.01, -0.02, 0.005])
+    state = State(camera=camera_vector(lens), board=board, poses=poses)
 
     def costs(at):
         return _normal(at, obs, 1.0, 1e9).costs
@@ -115,9 +115,8 @@ def test_derivatives_are_those_of_the_cost():
 def test_perfect_corners_give_back_lens_and_print():
     shape = (0.002, 0.008, -0.004, 0.01)
     report = calibrate_intrinsics(see(3, noise=0, shape=shape), BOARD, config=FOUR)
-    truth = camera_vector(LENS)
-    assert np.allclose(vector(report)[:4] / truth[:4], 1, atol=1e-6)
-    assert np.allclose(vector(report)[4:], truth[4:], atol=1e-6)
+    assert np.allclose(vector(report)[:4] / TRUTH[:4], 1, atol=1e-6)
+    assert np.allclose(vector(report)[4:], TRUTH[4:], atol=1e-6)
     assert report.board.aspect == pytest.approx(shape[0], abs=1e-6)
     assert np.allclose(report.board.warp, shape[1:], atol=1e-6)
     assert report.rms_px < 1e-4
@@ -142,12 +141,12 @@ def test_the_order_of_the_views_does_not_matter():
 
 def test_the_covariance_says_how_large_errors_are():
     rng = np.random.default_rng(8)
-    truth, inside, whole = camera_vector(LENS), [], []
+    inside, whole = [], []
     for trial in range(14):
         shape = rng.normal(scale=[0.002, 0.006, 0.006, 0.006])
         report = calibrate_intrinsics(see(100 + trial, shape=shape), BOARD, config=FOUR)
         f = np.flatnonzero(report.sd)
-        e = (vector(report) - truth)[f]
+        e = (vector(report) - TRUTH)[f]
         inside.append(np.abs(e) < 1.96 * report.sd[f])
         whole.append(e @ np.linalg.solve(report.covariance[np.ix_(f, f)], e) / len(f))
     # 14 trials of 8 terms that go together: 95 % of them to within 6 %.
@@ -175,11 +174,10 @@ def test_corner_errors_shared_by_a_view_widen_the_covariance():
 
 def test_a_bent_board_taken_for_flat_gives_a_wrong_lens():
     seen = see(10, views=24, shape=(0.004, 0.02, 0, 0.01))
-    truth = camera_vector(LENS)
     shaped = calibrate_intrinsics(seen, BOARD, config=FOUR)
     flat = calibrate_intrinsics(seen, BOARD, config=replace(FOUR, board_shape=False))
-    assert abs(vector(shaped)[0] - truth[0]) < 4 * shaped.sd[0]
-    assert abs(vector(flat)[0] - truth[0]) > 3 * abs(vector(shaped)[0] - truth[0])
+    assert abs(vector(shaped)[0] - TRUTH[0]) < 4 * shaped.sd[0]
+    assert abs(vector(flat)[0] - TRUTH[0]) > 3 * abs(vector(shaped)[0] - TRUTH[0])
     assert np.abs(shaped.board.aspect - 0.004) < 4 * shaped.board.sd[1]
     assert {c.name: c.verdict for c in shaped.checks}["board shape"] == "warn"
 
@@ -269,13 +267,8 @@ def test_small_and_straight_views_are_left_out_with_the_reason():
 def test_what_cannot_be_is_refused_with_names():
     seen = see(22, views=5)
     odd = TargetDetection(point_ids=seen[2].point_ids, uv=seen[2].uv / 2, image_size=(640, 360))
-    refused(
-        r"not c\.png \(640x360\)",
-        calibrate_intrinsics,
-        [*seen[:2], odd, *seen[3:]],
-        BOARD,
-        names=[f"{c}.png" for c in "abcde"],
-    )
+    mixed, names = [*seen[:2], odd, *seen[3:]], [f"{c}.png" for c in "abcde"]
+    refused(r"not c\.png \(640x360\)", calibrate_intrinsics, mixed, BOARD, names=names)
     half = replace(LENS, width=640, height=360, cx=320, cy=180)
     refused("scale the intrinsics", calibrate_intrinsics, seen, BOARD, start=half)
     refused("no views", calibrate_intrinsics, [], BOARD)
@@ -297,10 +290,9 @@ def test_predicted_sigmas_weigh_the_corners():
         uv = np.clip(d.uv + rng.normal(size=d.uv.shape) * (sd[:, None] - 0.03), 0, [1279, 719])
         blurred.append(replace(d, uv=uv, sd_px=sd))
     blind = [replace(d, sd_px=None) for d in blurred]
-    truth = camera_vector(LENS)[:8]
     weighed, same = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (blurred, blind))
     assert np.median(weighed.sd[:8] / same.sd[:8]) < 0.8
-    assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
+    assert np.all(np.abs(vector(weighed) - TRUTH)[:8] < 4 * weighed.sd[:8])
 
 
 # --- Where the corners were: what the views cover, and what is missing.

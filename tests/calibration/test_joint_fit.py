@@ -153,11 +153,10 @@ def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simu
     ours, theirs = np.linalg.inv(fit.information), np.linalg.inv(J.T @ J)[:shared, :shared]
     scale = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))
     assert np.abs((ours - theirs) / scale).max() < 1e-3
-    assert np.all(
-        np.abs(np.linalg.solve(J.T @ J, J.T @ r))[:29] < 1e-3 * np.sqrt(np.diag(ours))[:29]
-    )
+    sd = np.sqrt(np.diag(ours))[:29]
+    assert np.all(np.abs(np.linalg.solve(J.T @ J, J.T @ r))[:29] < 1e-3 * sd)
     # The fit is at its optimum, so the linear step from there is nothing but the map's weights.
-    assert np.all(np.abs(fit.step[:29]) < 0.02 * np.sqrt(np.diag(ours))[:29])
+    assert np.all(np.abs(fit.step[:29]) < 0.02 * sd)
     if basis is not None:
         assert np.allclose(fit.step[29:], state.weights, atol=0.02)
 
@@ -165,14 +164,12 @@ def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simu
 def test_the_likelihood_finds_the_robots_share(simulate):
     from realsim_calibration.fit.noise_scale import estimate_ratio
 
-    found = []
+    # Truth: robot sd over the angle that a corner's 0.1 px subtends at f = 643 and 0.4 m.
+    px = 0.1 / 643
     for robot in (0.1e-3, 1e-3):
         problem, state, _ = fitted(simulate(3, views=30, robot=(robot, robot)))
         model = LinearModel(problem, state, problem.ones())
-        found.append(estimate_ratio(model, None, 0.1, 50.0, NoiseConfig()))
-    # Truth: robot sd over the angle that a corner's 0.1 px subtends at f = 643 and 0.4 m.
-    px = 0.1 / 643
-    for ratio, robot in zip(found, (0.1e-3, 1e-3), strict=True):
+        ratio = estimate_ratio(model, None, 0.1, 50.0, NoiseConfig())
         assert 0.6 < ratio[0] / (robot / px) < 1.7
         assert 0.6 < ratio[1] / (robot / 0.4 / px) < 1.7
 
@@ -201,10 +198,8 @@ def test_records_of_maps_give_the_basis_errors():
         assert isinstance(record, RobotErrorMap)
         assert np.allclose(record.twist(Ts), basis.columns @ w, atol=1e-15)
         assert np.allclose(se3.log(se3.invert(Ts) @ record.corrected(Ts)), basis.columns @ w)
-        assert (
-            record.beyond(Ts).max() == 0
-            and record.beyond(Ts @ se3.exp([2, 0, 0, 3, 0, 0])).min() > 1
-        )
+        assert record.beyond(Ts).max() == 0
+        assert record.beyond(Ts @ se3.exp([2, 0, 0, 3, 0, 0])).min() > 1
 
 
 @pytest.mark.parametrize("name", ["ur5e", "panda"])

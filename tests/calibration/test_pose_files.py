@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from pose_rows import all_readings, folder, random_poses, rows_of
-from realsim.errors import InputError
+from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
 from realsim_calibration.inputs.pose_file import read_pose_file
-from realsim_calibration.inputs.readings import ROTATIONS, reading_from_text
+from realsim_calibration.inputs.readings import (
+    EULER_ORDERS,
+    ROTATIONS,
+    PoseReading,
+    reading_from_text,
+)
 from refusals import refused
-
-READINGS = list(all_readings())
-
 
 # --- every reading in every layout --------------------------------------------------------------
 
@@ -55,11 +58,6 @@ def write_files(path, raw, one):
     return path
 
 
-def write_npz(path, raw, names):
-    np.savez(path, poses=raw, images=np.array(names))
-    return path
-
-
 def square(raw):
     return raw.reshape(-1, 4, 4).tolist() if raw.shape[1] == 16 else raw.tolist()
 
@@ -85,7 +83,7 @@ LAYOUTS = {
     "yaml": lambda d, r, n: as_json(d / "a.yaml", r.tolist()),
     "opencv": lambda d, r, n: write_opencv(d / "a.yml", r),
     "npy": lambda d, r, n: np.save(d / "a.npy", r) or d / "a.npy",
-    "npz": lambda d, r, n: write_npz(d / "a.npz", r, n),
+    "npz": lambda d, r, n: np.savez(d / "a.npz", poses=r, images=np.array(n)) or d / "a.npz",
     "json files": lambda d, r, n: write_files(d / "p", r, save_json),
     "txt files": lambda d, r, n: write_files(
         d / "p", r, lambda p, row: np.savetxt(p.with_suffix(".txt"), row[None], fmt="%.17g")
@@ -103,15 +101,11 @@ def brackets(path):
 
 def check(raw_poses, reading, T):
     assert len(raw_poses) == len(T)
-    assert any(
-        p == reading or (raw_poses.values.shape[1] == 16 and same_matrix(p, reading))
-        for p in raw_poses.possible
-    ), (str(reading), [str(p) for p in raw_poses.possible])
+    possible = set(raw_poses.possible)
+    if raw_poses.values.shape[1] == 16:  # nothing comes first in a whole matrix
+        possible |= {replace(p, position_first=reading.position_first) for p in possible}
+    assert reading in possible, (str(reading), [str(p) for p in possible])
     assert np.abs(raw_poses.poses(reading) - T).max() < 1e-12
-
-
-def same_matrix(p, reading):
-    return replace(p, position_first=reading.position_first) == reading
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -119,7 +113,7 @@ def same_matrix(p, reading):
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(3, 14),
-    reading=st.sampled_from(READINGS),
+    reading=st.sampled_from(list(all_readings())),
     wide=st.booleans(),
 )
 def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
@@ -215,16 +209,14 @@ def test_time_stamps_from_1970_and_from_the_machines_start(tmp_path, start, stop
     times = start + np.cumsum(rng.uniform(4, 20, 40) if stops else np.full(40, 0.033))
     rows = [f"{int(t * unit)},0.{k:02d},0.1,0.2,0,0,0,1" for k, t in enumerate(times, 10)]
     (tmp_path / "a.csv").write_text("\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows]))
-    found = read_pose_file(tmp_path / "a.csv")
-    assert np.allclose(found.times, times, atol=2e-6)
+    assert np.allclose(read_pose_file(tmp_path / "a.csv").times, times, atol=2e-6)
 
 
 def test_text_of_spreadsheets_and_windows(tmp_path):
     raw = rows_of(reading_from_text("rotvec,m"), random_poses(12, 4))
     text = "\r\n".join(" ".join(map(number, r)) for r in raw)
-    for k, data in enumerate(
-        (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
-    ):
+    encoded = (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
+    for k, data in enumerate(encoded):
         (tmp_path / f"{k}.txt").write_bytes(data)
         assert np.array_equal(read_pose_file(tmp_path / f"{k}.txt").values, raw)
 
@@ -277,23 +269,19 @@ def test_matrices_as_blocks_of_lines_and_of_few_decimals(tmp_path):
 
 def test_numbers_leave_open_what_they_do_not_say(tmp_path):
     T = random_poses(10, 12)
-    six = read_pose_file(
-        write_lines(tmp_path / "a.txt", rows_of(reading_from_text("euler_ZYX,deg,mm"), T), " ")
-    )
+    rows = rows_of(reading_from_text("euler_ZYX,deg,mm"), T)
+    six = read_pose_file(write_lines(tmp_path / "a.txt", rows, " "))
     assert {p.angle_unit for p in six.possible if p.position_first} == {"deg"}
     assert {p.length_unit for p in six.possible if p.position_first} == {"mm"}
     assert {p.rotation for p in six.possible} == {r for r in ROTATIONS if r[:3] in ("eul", "rot")}
     assert six.stated is None
     near = T.copy()
     near[:, :3, 3] = 10.0 / 1000 * se3.random_rotation(np.random.default_rng(0), 12)[:, 0]
-    open_unit = read_pose_file(
-        write_lines(tmp_path / "b.txt", rows_of(reading_from_text("quat_wxyz,mm"), near), " ")
-    )
+    rows = rows_of(reading_from_text("quat_wxyz,mm"), near)
+    open_unit = read_pose_file(write_lines(tmp_path / "b.txt", rows, " "))
     assert {p.length_unit for p in open_unit.possible} == {"m", "mm"}
-    assert {p.rotation for p in open_unit.possible if p.position_first} == {
-        "quaternion_xyzw",
-        "quaternion_wxyz",
-    }
+    rotations = {p.rotation for p in open_unit.possible if p.position_first}
+    assert rotations == {"quaternion_xyzw", "quaternion_wxyz"}
     still = np.tile(np.eye(4), (4, 1, 1))
     both = read_pose_file(as_json(tmp_path / "c.json", still.tolist()))
     assert {p.rotation for p in both.possible} == {"matrix", "matrix_column_major"}
@@ -341,9 +329,8 @@ def test_bombs_and_pickles_are_refused(tmp_path):
     for name in ("a.npy", "a.npz"):
         refused(r"pickled|Python objects", read_pose_file, tmp_path / name)
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (10**11, 6)}
-    )
+    huge = {"descr": "<f8", "fortran_order": False, "shape": (10**11, 6)}
+    np.lib.format.write_array_header_1_0(header, huge)
     (tmp_path / "huge.npy").write_bytes(header.getvalue())
     refused("not a readable npy", read_pose_file, tmp_path / "huge.npy")
 
@@ -362,3 +349,82 @@ def test_no_content_whatever_ends_in_a_traceback(data, ending):
             read_pose_file(path)
         except InputError as error:
             assert str(path) in str(error)
+
+
+# --- Readings: numbers to poses, and what is unclear.
+
+
+def test_euler_orders_are_scipys():
+    angles = np.random.default_rng(1).uniform(-7, 7, (50, 3))
+    for order in EULER_ORDERS:
+        T = PoseReading(rotation=f"euler_{order}").apply(np.hstack([np.zeros((50, 3)), angles]))
+        assert np.abs(T[:, :3, :3] - Rotation.from_euler(order, angles).as_matrix()).max() < 1e-14
+
+
+def test_known_poses():
+    c = np.cos(np.pi / 6)
+    R = [[c, -0.5, 0], [0.5, c, 0], [0, 0, 1]]  # 30 deg about z
+    w, s = np.cos(np.pi / 12), np.sin(np.pi / 12)
+    for text, row in {
+        "rotvec,mm": [100, 200, 300, 0, 0, np.pi / 6],
+        "rotvec,deg,m": [0.1, 0.2, 0.3, 0, 0, 30],
+        "quat_xyzw,m": [0.1, 0.2, 0.3, 0, 0, s, w],
+        "quat_wxyz,m": [0.1, 0.2, 0.3, w, 0, 0, s],
+        "euler_xyz,deg,m,rotation_first": [0, 0, 30, 0.1, 0.2, 0.3],
+        "euler_ZYX,deg,m": [0.1, 0.2, 0.3, 30, 0, 0],
+        "matrix,m": [*R[0], 0.1, *R[1], 0.2, *R[2], 0.3, 0, 0, 0, 1],
+        "matrix_column_major,m": [c, 0.5, 0, 0, -0.5, c, 0, 0, 0, 0, 1, 0, 0.1, 0.2, 0.3, 1],
+    }.items():
+        T = reading_from_text(text).apply(row)[0]
+        assert np.allclose(T[:3, :3], R, atol=1e-12), text
+        assert np.allclose(T[:3, 3], [0.1, 0.2, 0.3], atol=1e-12), text
+        inverse = reading_from_text(text + ",inverted").apply(row)[0]
+        assert np.allclose(inverse @ T, np.eye(4), atol=1e-12), text
+
+
+def test_texts_and_numbers_of_every_reading_come_back():
+    T = random_poses(3, 6)
+    for reading in all_readings():
+        assert reading_from_text(str(reading)) == reading
+        for width in reading.widths:
+            raw = rows_of(reading, T, width=width)
+            assert raw.shape == (6, width) and reading.fits(raw).all()
+            assert np.abs(reading.apply(raw) - T).max() < 1e-12, reading
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("rotvec", "length unit"),
+        ("mm,inverted", "rotation's format"),
+        ("rotvec,mm,m", "two things"),
+        ("euler_XYZ,mm", "angle unit"),
+        ("euler_XYx,deg,mm", "not known"),
+        ("euler_xxy,deg,mm", "not known"),
+        ("quat,m", "not known"),
+        ("quat_xyzw,deg,m", "no angles"),
+    ],
+)
+def test_unclear_readings_are_refused_with_what_is_accepted(text, says):
+    refused(says, reading_from_text, text)
+
+
+def test_rows_that_are_no_poses_are_named():
+    reading = PoseReading(rotation="matrix")
+    raw = rows_of(reading, random_poses(0, 5))
+    names = [f"line {k}" for k in range(10, 15)]
+    for change, error, says in (
+        (lambda r: r.__setitem__((2, 0), np.nan), InputError, r"line 12 \(1 of 5\).*NaN"),
+        (lambda r: r.__setitem__((1, slice(0, 3)), -r[1, :3]), NotRigidError, "line 11.*mirrored"),
+        (lambda r: r.__setitem__((3, slice(0, 3)), 2 * r[3, :3]), NotRigidError, "line 13.*not a"),
+        (lambda r: r.__setitem__((4, 12), 0.2), NotRigidError, "line 14.*last row"),
+        (lambda r: r.__setitem__((4, 3), 650.0), UnitError, "line 14.*--reading matrix,mm if"),
+    ):
+        bad = raw.copy()
+        change(bad)
+        refused(says, reading.apply, bad, error=error, rows=names)
+        assert reading.fits(bad).sum() == (5 if error is UnitError else 4)
+    apply, long = PoseReading(rotation="quaternion_xyzw").apply, np.eye(7)[[6, 3]]
+    long[1, 4] = 1
+    refused(r"row 1.*length 1", apply, long, error=NotRigidError)
+    refused("takes 7 numbers", apply, np.zeros((3, 6)))

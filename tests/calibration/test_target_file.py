@@ -57,25 +57,19 @@ def targets(draw: st.DrawFn) -> Target:
         )
     if kind == "charuco":
         square = draw(lengths)
+        large = [n for n in dictionary_names() if dictionary_size(n) >= 40]
         return CharucoBoard(
             rows=draw(st.integers(3, 9)),
             columns=draw(st.integers(3, 9)),
             square_m=square,
             marker_m=square * draw(st.floats(0.3, 0.95)),
-            dictionary=draw(
-                st.sampled_from([n for n in dictionary_names() if dictionary_size(n) >= 40])
-            ),
+            dictionary=draw(st.sampled_from(large)),
             legacy=draw(st.booleans()),
         )
     if kind == "chessboard":
         return Chessboard(rows=draw(counts), columns=draw(counts), square_m=draw(lengths))
-    return CircleGrid(
-        rows=draw(counts),
-        columns=draw(counts),
-        pitch_m=draw(lengths),
-        asymmetric=draw(st.booleans()),
-        large_origin=draw(st.booleans()),
-    )
+    kinds = {"asymmetric": st.booleans(), "large_origin": st.booleans()}
+    return draw(st.builds(CircleGrid, rows=counts, columns=counts, pitch_m=lengths, **kinds))
 
 
 @given(target=targets())
@@ -93,9 +87,8 @@ def test_every_target_comes_back_from_json_and_from_its_line(target: Target) -> 
 def test_millimetres_are_scaled_as_decimal_numbers(tenths: int) -> None:
     mm, metres = f"{tenths // 10}.{tenths % 10}", float(f"{tenths}e-4")
     assert parse_length(f"{mm}mm", "square") == metres
-    board = target_from_json(
-        {"kind": "chessboard", "rows": 6, "columns": 8, "square_mm": float(mm)}
-    )
+    told = {"kind": "chessboard", "rows": 6, "columns": 8, "square_mm": float(mm)}
+    board = target_from_json(told)
     assert isinstance(board, Chessboard) and board.square_m == metres
 
 
