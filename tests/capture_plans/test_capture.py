@@ -1,14 +1,8 @@
-"""A capture goes on after a kill, stores what the plan says, and refuses what it should.
+"""A capture goes on after a kill, stores what the plan says, and refuses what it should."""
 
-Run as a script, this file captures slowly into a folder until it is killed.
-"""
-
-import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from begun_sessions import begun
 from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through, stopped
+from killed_children import killed_growing
+from realsim.app.capture.fixed import fixed_stores, open_fixed, serials_of
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
@@ -27,18 +23,14 @@ from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5, UR5E
 from realsim.robots.limits import JointLimits
 from realsim.store import SessionStore, atomic
-from realsim_capture_plans.capturing.capture import (
-    PLAN_FILE,
-    CaptureConfig,
-    CaptureJob,
-    capture,
-    dry_run,
-)
+from realsim.store.cameras import open_cameras
+from realsim_capture_plans.capturing.capture import PLAN_FILE, capture, dry_run
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
+from realsim_capture_plans.capturing.run import CaptureJob, CaptureSummary
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, DeviceError, Frame
 from realsim_capture_plans.plan_files.imported import colliding_legs
-from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
+from realsim_capture_plans.plan_files.plan_json import load_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from refusals import refused
 
@@ -137,10 +129,8 @@ def arm() -> KinematicArm:
 
 def test_every_view_of_the_plan_is_stored_once(tmp_path: Path, arm: KinematicArm) -> None:
     store = new_store(tmp_path / "session", plan().content_hash)
-    calls: list[tuple[int, int]] = []
-    summary = capture(
-        plan(), arm, TableCamera(arm), store, progress=lambda d, n: calls.append((d, n))
-    )
+    calls: list[tuple[int, ...]] = []
+    summary = capture(plan(), arm, TableCamera(arm), store, progress=lambda *n: calls.append(n))
     assert (summary.captured, summary.skipped, summary.rejected) == (VIEWS, 0, ())
     assert summary.noted == summary.warnings == () and summary.complete
     assert calls == [(k, VIEWS) for k in range(VIEWS + 1)]
@@ -151,11 +141,7 @@ def test_every_view_of_the_plan_is_stored_once(tmp_path: Path, arm: KinematicArm
         expected = UR5.forward(plan().joints[view.index]) @ d405_mount().T_ee_cam
         middle = store.depth_m(view.index)[23:25, 31:33].mean()
         assert middle == pytest.approx(-expected[2, 3] / expected[2, 2], abs=2e-3)
-    assert load_plan_of(store).content_hash == plan().content_hash
-
-
-def load_plan_of(store: SessionStore) -> CapturePlan:
-    return load_plan(store.path(PLAN_FILE))
+    assert load_plan(store.path(PLAN_FILE)).content_hash == plan().content_hash
 
 
 def test_going_on_takes_only_what_is_missing_and_stays_clear(
@@ -254,7 +240,7 @@ def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
     visited = np.stack(arm.path)
     assert all(np.any(np.all(visited == q, axis=1)) for q in plan().joints)
     assert {s for s, _ in arm.speeds} == {0.25 * plan().config.speed}
-    refused("at most 1 is accepted", CaptureConfig, speed_scale=1.5)
+    refused("at most 1 is accepted", replace, QUICK, speed_scale=1.5)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -265,9 +251,8 @@ def test_views_asked_for_and_views_taken_again(store: SessionStore, arm: Kinemat
     before = {k: (store.path(f"rgb/{k:06d}.png").read_bytes(), store.rgb(k)) for k in (2, 7)}
     stamps = {v.index: v.time_s for v in store.session.views}
     # The same place gives the same image; the time stamp tells the two apart.
-    again = capture(
-        plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(2,), retake=(7,))
-    )
+    job = CaptureJob(views=(2,), retake=(7,))
+    again = capture(plan(), arm, camera, store, config=QUICK, job=job)
     assert (again.captured, again.skipped) == (1, 1)
     store = SessionStore.open(store.folder)
     assert store.completed == {2, 7} and store.verify() == []
@@ -329,28 +314,14 @@ def test_the_log_says_what_happened_and_is_listed(store: SessionStore, arm: Kine
     assert store.path(LOG_FILE).stat().st_size == size
 
 
-def wait_for(condition: Callable[[], bool], seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "the capture did not get there in time"
-        time.sleep(0.01)
-
-
-def test_a_killed_capture_goes_on_without_losing_a_view(tmp_path: Path) -> None:
-    save_plan(plan(), tmp_path / "plan.json")
+def test_a_killed_capture_goes_on_without_losing_a_view(tmp_path: Path, arm: KinematicArm) -> None:
     folder = tmp_path / "session"
-    robot = folder / "robot.jsonl"
 
-    def lines() -> int:
-        return robot.read_bytes().count(b"\n") if robot.is_file() else 0
+    def slow_capture() -> None:
+        store = new_store(folder, plan().content_hash)
+        capture(plan(), arm, TableCamera(arm, seconds=0.15), store)
 
-    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1] / "support")}
-    child = subprocess.Popen([sys.executable, __file__, str(tmp_path)], env=env)
-    try:
-        wait_for(lambda: lines() >= 4, 60.0)
-    finally:
-        os.kill(child.pid, signal.SIGKILL)
-        child.wait()
+    killed_growing(slow_capture, folder / "robot.jsonl", 4, 0.0)
     done = SessionStore.open(folder).completed
     assert 4 <= len(done) < VIEWS
     arm = KinematicArm(joints=plan().joints[max(done)].copy())
@@ -362,12 +333,84 @@ def test_a_killed_capture_goes_on_without_losing_a_view(tmp_path: Path) -> None:
         assert np.array_equal(view.joints, plan().joints[view.index])
 
 
-def slow_capture(folder: Path) -> None:
-    the_plan = load_plan(folder / "plan.json")
-    store = new_store(folder / "session", the_plan.content_hash)
-    arm = KinematicArm(joints=the_plan.home.copy())
-    capture(the_plan, arm, TableCamera(arm, seconds=0.15), store)
+# --- Fixed cameras beside the one in the hand.
+
+LENS = CameraIntrinsics(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
 
 
-if __name__ == "__main__":
-    slow_capture(Path(sys.argv[1]))
+@dataclass
+class StillCamera:
+    """Counts its frames in their grey value; gives none where `fails_at` says so."""
+
+    name: str = "still 1"
+    fails_at: int = -1
+    taken: int = 0
+    intrinsics: CameraIntrinsics = LENS
+    depth_unit_m: float = 2e-4
+    description: dict[str, Any] = field(default_factory=dict)
+
+    def grab(self) -> Frame:
+        if self.taken == self.fails_at:
+            self.fails_at = -1
+            raise DeviceError("the fixed camera gave no frame.")
+        self.taken += 1
+        rgb = np.full((24, 32, 3), self.taken, np.uint8)
+        return Frame(rgb=rgb, depth_m=np.full((24, 32), 0.7, np.float32), time_s=float(self.taken))
+
+    def recover(self) -> None:
+        pass
+
+
+def taken(arm: KinematicArm, store: SessionStore, fixed: Any, **job: Any) -> CaptureSummary:
+    work = CaptureJob(fixed=fixed, **job)
+    return capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=work)
+
+
+def test_each_view_has_a_frame_of_each_fixed_camera(store: SessionStore, arm: KinematicArm) -> None:
+    still = StillCamera()
+    assert taken(arm, store, fixed_stores(store, {"left": still}), views=(0, 2, 3)).complete
+    left = open_cameras(SessionStore.open(store.folder))["left"]
+    assert [v.index for v in left.session.views] == [0, 2, 3]
+    assert [int(left.rgb(k)[0, 0, 0]) for k in (0, 2, 3)] == [1, 2, 3]
+    assert np.allclose(left.depth_m(2), 0.7)
+    assert (left.session.intrinsics.width, left.session.depth_unit_m) == (32, 2e-4)
+    assert left.check().sound and store.check().sound
+
+
+def test_a_view_counts_when_all_cameras_have_it(store: SessionStore, arm: KinematicArm) -> None:
+    still = StillCamera(fails_at=1)
+    fixed = fixed_stores(store, {"left": still})
+    refused("camera gave no frame", taken, arm, store, fixed, views=(0, 1), error=DeviceError)
+    assert store.completed == {0}
+    again = SessionStore.open(store.folder)
+    assert taken(arm, again, fixed_stores(again, {"left": still}), views=(0, 1)).complete
+    assert open_cameras(again)["left"].completed == again.completed == {0, 1}
+
+
+def test_a_retaken_view_is_of_all_cameras(store: SessionStore, arm: KinematicArm) -> None:
+    fixed = fixed_stores(store, {"left": StillCamera()})
+    taken(arm, store, fixed, views=(0, 1))
+    taken(arm, store, fixed, views=(), retake=(1,))
+    left = open_cameras(store)["left"]
+    assert [int(left.rgb(k)[0, 0, 0]) for k in (0, 1)] == [1, 3]
+
+
+def test_a_capture_goes_on_with_its_first_cameras(store: SessionStore, arm: KinematicArm) -> None:
+    still = StillCamera()
+    taken(arm, store, fixed_stores(store, {"left": still}), views=(0,))
+    refused(r"begun with the fixed cameras left, and .* names none", fixed_stores, store, {})
+    refused("names left, right", fixed_stores, store, {"left": still, "right": StillCamera()})
+    with pytest.raises(InputError, match=r"'left' of .* is still 1, .* connects still 2"):
+        fixed_stores(store, {"left": StillCamera(name="still 2")})
+
+
+@pytest.mark.parametrize("text", ["left", "left=", "=12", "left=1,left=2", "left=1,right=1"])
+def test_other_forms_of_the_option_are_refused(text: str) -> None:
+    refused("left=SERIAL,right=SERIAL is expected", serials_of, text)
+
+
+def test_the_simulated_lab_has_no_fixed_camera() -> None:
+    assert serials_of("left=12, top=34") == {"left": "12", "top": "34"}
+    refused("no name of a camera", serials_of, "a/b=12")
+    with ExitStack() as stack, pytest.raises(InputError, match="simulated lab has one camera"):
+        open_fixed("left=12", True, stack)

@@ -27,6 +27,8 @@ from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_cont
 from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
+from realsim_capture_plans.devices.ur import UrArm
+from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.lab.lab import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.planning.record import CapturePlan
@@ -77,15 +79,13 @@ class StoppingArm(SimulatedArm):
         self.stopped = False
 
 
+Spoil = dict[int, Callable[[Frame, Frame], Frame]] | None
+
+
 class SpoiltCamera:
     """The lab's camera with frames that are spoilt: {number of the grab: what is done to it}."""
 
-    def __init__(
-        self,
-        arm: SimulatedArm,
-        camera: SimulatedDepthCamera,
-        spoil: dict[int, Callable[[Frame, Frame], Frame]] | None = None,
-    ) -> None:
+    def __init__(self, arm: SimulatedArm, camera: SimulatedDepthCamera, spoil: Spoil) -> None:
         """Spoil these grabs, counted from 1; each is given the frame and the one before."""
         self._arm, self._camera, self.spoil = arm, camera, spoil or {}
         self.name, self.description = camera.name, camera.description
@@ -197,11 +197,7 @@ class Bench:
         return capture(plan(), self.arm, self.camera, self.store, config=QUICK, job=work)
 
 
-def bench(
-    folder: Path,
-    spoil: dict[int, Callable[[Frame, Frame], Frame]] | None = None,
-    arm: SimulatedArm | None = None,
-) -> Bench:
+def bench(folder: Path, spoil: Spoil = None, arm: SimulatedArm | None = None) -> Bench:
     a = arm or SimulatedArm()
     there, on_table = lab()
     camera = SimulatedDepthCamera(there.config, there.truth, a, lambda: on_table)
@@ -222,9 +218,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
 def assert_same_views(store: SessionStore, reference: SessionStore) -> None:
     assert store.completed == reference.completed and store.verify() == []
     for k in reference.completed:
-        assert store.path(f"rgb/{k:06d}.png").read_bytes() == (
-            reference.path(f"rgb/{k:06d}.png").read_bytes()
-        )
+        name = f"rgb/{k:06d}.png"
+        assert store.path(name).read_bytes() == reference.path(name).read_bytes()
         assert np.array_equal(store.depth_m(k), reference.depth_m(k))
 
 
@@ -315,3 +310,62 @@ def test_a_doubt_that_stays_is_stored_with_a_note_and_three_in_a_row_are_asked_a
     b = bench(tmp_path / "nobody", spoil)
     summary = b.capture()
     assert summary.complete and [k for k, _ in summary.noted] == [5, 6, 7, 8]
+
+
+# --- A whole capture with the UR driver: real ur_rtde, loopback controller, the lab's camera.
+
+STOPS = 4
+HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+
+
+def small_plan(center: np.ndarray) -> CapturePlan:
+    """Views on a narrow ring that look down at a point of the table."""
+    turns = np.linspace(0.0, 2 * np.pi, STOPS, endpoint=False)
+    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
+    joints = joints_looking_at(center, eyes, HOME)
+    return plan_through(np.stack(joints), HOME, center, "calibration")
+
+
+class PersonAtThePendant(NoOperator):
+    """Clears whatever stopped the arm, then says go."""
+
+    def __init__(self, controller: LoopbackController) -> None:
+        self.controller = controller
+        self.told: list[str] = []
+        self.asked = 0
+
+    def tell(self, text: str, *, trouble: bool = False) -> None:
+        self.told.append(text)
+
+    def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
+        self.asked += 1
+        self.controller.clear()
+        return "go"
+
+
+@pytest.mark.slow
+def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path: Path) -> None:
+    lab = SimulatedLab(LabConfig(width=128, height=72, n_objects=1))
+    lab.place_board()
+    plan = small_plan(lab.scene_center)
+    words = {"tcp": "0,0,0.12,0,0,0.5", "joints": ",".join(map(str, HOME))}
+    with LoopbackController.start(robot="UR5", speedup=10, **words) as controller:
+        with UrArm(controller.host, model="UR5") as arm:
+            camera = SimulatedDepthCamera(lab.config, lab.truth, arm, lambda: lab._on_table)
+            store = begun(tmp_path / "session", camera.intrinsics, {"plan_hash": plan.content_hash})
+            controller.inject("protective_stop", at_progress=0.4)
+            with pytest.raises(ArmStoppedError, match="protective stop"):
+                capture(plan, arm, camera, store)  # nobody can be asked
+            controller.clear()
+            arm.recover()
+            person = PersonAtThePendant(controller)
+            controller.inject("emergency_stop", at_progress=0.7)
+            summary = capture(plan, arm, camera, store, job=CaptureJob(operator=person))
+    assert summary.complete and person.asked == 1
+    assert any("emergency stop" in text and "red button" in text for text in person.told)
+    store = SessionStore.open(tmp_path / "session")
+    assert store.completed == set(range(STOPS))
+    for view in store.session.views:
+        np.testing.assert_allclose(view.joints, plan.joints[view.index], atol=1e-9)
+        np.testing.assert_allclose(view.T_base_ee, plan.Ts_base_ee[view.index], atol=1e-9)
+        assert np.mean(store.depth_m(view.index) > 0) > 0.5

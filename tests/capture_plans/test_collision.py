@@ -36,10 +36,8 @@ def model(chain: DhChain = UR5, mount: Mount | None = None, cell: WorkCell = CEL
 
 
 def piece(kind: str, size: tuple[float, ...], at: list[float]) -> Shape:
-    return Shape(
-        part="bracket", frame=6, kind=kind, size_m=size,
-        T_frame_shape=se3.from_translation(at),
-    )  # fmt: skip
+    T = se3.from_translation(at)
+    return Shape(part="bracket", frame=6, kind=kind, size_m=size, T_frame_shape=T)
 
 
 @pytest.mark.parametrize("chain", [UR5E, calibrated(UR5, 1)], ids=["UR5e", "calibrated"])
@@ -73,9 +71,8 @@ def test_turning_arm_and_cell_together_changes_nothing() -> None:
         ends = np.nan_to_num(np.array([box.lower, box.upper]), posinf=4, neginf=-4) @ quarter.T
         return Box(lower=tuple(ends.min(0).tolist()), upper=tuple(ends.max(0).tolist()))
 
-    there = WorkCell(
-        table=turned(TABLE), keep_out=turned(KEEP_OUT), obstacles=(("lamp", turned(LAMP)),)
-    )
+    lamp = ("lamp", turned(LAMP))
+    there = WorkCell(table=turned(TABLE), keep_out=turned(KEEP_OUT), obstacles=(lamp,))
     q = joints(200, 3)
     before = model().clearance(q)
     after = model(cell=there).clearance(q + np.eye(6)[0] * np.pi / 2)
@@ -101,10 +98,8 @@ def lowest(shape: Shape, T: np.ndarray) -> np.ndarray:
 
 def test_height_above_a_table_is_the_lowest_point() -> None:
     depth = 0.5
-    cell = WorkCell(
-        table=replace(EVERYWHERE, upper=(INF, INF, -depth)),
-        keep_out=Box(lower=(3, 3, 3), upper=(4, 4, 4)),
-    )
+    table = replace(EVERYWHERE, upper=(INF, INF, -depth))
+    cell = WorkCell(table=table, keep_out=Box(lower=(3, 3, 3), upper=(4, 4, 4)))
     mount, q = d405_mount(), joints(400, 5)
     frames = UR5.link_frames(q)
     shapes = [s for s in arm_of(UR5).shapes if s.frame >= 2] + [camera_shape(mount), *mount.bracket]
@@ -195,10 +190,6 @@ def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
 BENCH = replace(CELL, obstacles=())
 
 
-def unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v)
-
-
 def chain_through(axes: list[tuple[np.ndarray, np.ndarray]]) -> DhChain:
     """The UR5 whose joint axes 1-6 at zero are these lines (point, direction), in DH numbers.
 
@@ -210,8 +201,8 @@ def chain_through(axes: list[tuple[np.ndarray, np.ndarray]]) -> DhChain:
     o, x, z = np.zeros(3), np.array([1.0, 0, 0]), axes[0][1]
     for i in range(5):
         p, z_next = axes[i + 1]
-        normal = unit(np.cross(z, z_next))
-        normal *= np.sign(normal @ nominal[i + 1][:3, 0]) or 1.0
+        normal = np.cross(z, z_next)
+        normal *= (np.sign(normal @ nominal[i + 1][:3, 0]) or 1.0) / np.linalg.norm(normal)
         # Feet of the common normal: o + d z + a normal = p + s z_next.
         d, a, _ = np.linalg.solve(np.stack([z, normal, -z_next], axis=-1), p - o)
         theta = np.arctan2(np.cross(x, normal) @ z, x @ normal)
@@ -251,10 +242,8 @@ def test_links_stay_within_millimetres_of_the_nominal_ones() -> None:
 
 
 def test_clearances_change_by_millimetres_only() -> None:
-    arm = ARMS[0]
-    q = np.random.default_rng(3).uniform(-np.pi, np.pi, (200, 6))
-    mount = d405_mount()
-    nominal, real = (CollisionModel(chain, mount, BENCH, 0.01) for chain in (UR5, arm))
+    q = joints(200, 3)
+    nominal, real = model(cell=BENCH), model(ARMS[0], cell=BENCH)
     assert real.pairs == nominal.pairs
     before, after = nominal.clearance(q), real.clearance(q)
     for group in GROUPS:

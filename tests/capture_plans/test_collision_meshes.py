@@ -39,9 +39,8 @@ def outside(shape: Shape, points: np.ndarray) -> np.ndarray:
 def quartered(triangles: np.ndarray) -> np.ndarray:
     a, b, c = np.moveaxis(triangles, 1, 0)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    return np.concatenate(
-        [np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    )
+    parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(t, 1) for t in parts])
 
 
 @pytest.mark.parametrize("frame", range(7), ids=arm_of(UR5).link_names)
@@ -63,13 +62,8 @@ def test_every_triangle_lies_inside_our_shapes(frame: int) -> None:
 
 
 ACROSS = se3.from_translation([0.02, 0.07, 0.02])
-D435 = Mount(
-    name="D435 across",
-    camera="D435",
-    T_ee_cam=ACROSS,
-    bracket=plain_bracket(ACROSS, "D435"),
-    cover_m=0.005,
-)
+BRACKET = plain_bracket(ACROSS, "D435")
+D435 = Mount(name="across", camera="D435", T_ee_cam=ACROSS, bracket=BRACKET, cover_m=0.005)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,9 @@
 """The simulated devices keep the protocols, tell no truth, and see what is really there."""
 
-import json
-
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import DegenerateError
 from realsim.geometry import camera as lens
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
@@ -29,7 +27,6 @@ from realsim_capture_plans.lab.truth import (
 )
 from refusals import refused
 
-SMALL = {"width": 640, "height": 360}
 PARTS = ("cube", "cylinder_can", "gear")
 
 
@@ -42,7 +39,7 @@ def joints_at(lab, offset):
 
 @pytest.fixture(scope="module")
 def lab():
-    return SimulatedLab(LabConfig(seed=11, objects=PARTS, **SMALL))
+    return SimulatedLab(LabConfig(seed=11, objects=PARTS, width=640, height=360))
 
 
 def test_the_devices_public_names_are_those_of_the_protocols_alone(lab):
@@ -58,14 +55,8 @@ def test_the_devices_public_names_are_those_of_the_protocols_alone(lab):
 def test_a_goal_beyond_the_limits_is_refused_and_the_arm_stays(lab):
     lab.arm.move(joints_at(lab, [0.05, 0.0, 0.35]))
     before = lab.arm.state()
-    for goal in (
-        np.full(6, 7.0),
-        np.array([0, 0, 3.5, 0, 0, 0.0]),
-        np.zeros(5),
-        np.full(6, np.nan),
-    ):
-        with pytest.raises(InputError):
-            lab.arm.move(goal)
+    for goal in (np.full(6, 7.0), [0, 0, 3.5, 0, 0, 0.0], np.zeros(5), np.full(6, np.nan)):
+        refused(".", lab.arm.move, np.array(goal))
     np.testing.assert_array_equal(lab.arm.state().joints, before.joints)
 
 
@@ -93,13 +84,11 @@ def tag_corners(rgb):
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(
-        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters
-    )
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
     corners, ids, _ = detector.detectMarkers(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-    return (
-        {} if ids is None else dict(zip(ids.ravel().tolist(), np.array(corners)[:, 0], strict=True))
-    )
+    assert ids is not None
+    return dict(zip(ids.ravel().tolist(), np.array(corners)[:, 0], strict=True))
 
 
 def test_true_board_corners_project_onto_the_tags_in_the_picture():
@@ -142,8 +131,7 @@ def test_depth_agrees_with_the_true_scene_within_the_sensors_noise(lab):
         assert seen.sum() > 0.6 * (labels.ids == o.instance).sum() > 200
         z = labels.depth_m[seen]
         sensor = DepthSensorModel()
-        sigma = sensor.sigma_z(z, lab.truth.intrinsics)
-        gap = (frame.depth_m[seen] - z) / sigma
+        gap = (frame.depth_m[seen] - z) / sensor.sigma_z(z, lab.truth.intrinsics)
         assert np.median(np.abs(gap)) == pytest.approx(0.6745, rel=0.25)
         # Pixels within the matching window are not independent of each other.
         independent = seen.sum() / (4 * np.pi * sensor.correlation_px**2)
@@ -188,9 +176,8 @@ def test_repeatability_belongs_to_the_stop_and_has_its_size():
     truth = SimulatedLab(LabConfig(seed=1, objects=ROD)).truth
     np.testing.assert_array_equal(truth.T_base_ee(Q), truth.T_base_ee(Q.copy()))
     stops = Q + np.random.default_rng(0).uniform(-1, 1, (200, 6))
-    noise = np.array(
-        [se3.log(se3.invert(truth.chain.forward(q)) @ truth.T_base_ee(q)) for q in stops]
-    )
+    reached = np.array([truth.T_base_ee(q) for q in stops])
+    noise = se3.log(se3.invert(truth.chain.forward(stops)) @ reached)
     assert np.std(noise[:, 3:]) == pytest.approx(0.03e-3, rel=0.1)
     assert np.std(noise[:, :3]) == pytest.approx(np.radians(0.01), rel=0.1)
     assert abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.2
@@ -224,10 +211,9 @@ def test_truth_survives_the_disk_and_knows_every_view(tmp_path):
 
 def test_a_missing_broken_or_foreign_truth_is_refused(tmp_path):
     refused("there is no truth", load_truth, tmp_path)
-    (tmp_path / "truth.json").write_text("{")
-    refused("not valid JSON", load_truth, tmp_path)
-    (tmp_path / "truth.json").write_text(json.dumps({"version": 99}))
-    refused("version", load_truth, tmp_path)
+    for text, says in (("{", "not valid JSON"), ('{"version": 99}', "version")):
+        (tmp_path / "truth.json").write_text(text)
+        refused(says, load_truth, tmp_path)
 
 
 def test_the_operator_is_off_by_the_configured_amount_in_all_directions():
@@ -240,8 +226,7 @@ def test_the_operator_is_off_by_the_configured_amount_in_all_directions():
             assert start.verdict == "unchecked"
             offs.append(se3.invert(true.T_world_obj) @ start.T_world_obj)
     offs = np.array(offs)
-    rms = np.sqrt(np.mean(np.sum(offs[:, :3, 3] ** 2, axis=1)))
-    assert rms == pytest.approx(8e-3, rel=0.1)
+    assert np.sqrt(np.mean(np.sum(offs[:, :3, 3] ** 2, axis=1))) == pytest.approx(8e-3, rel=0.1)
     assert np.sqrt(np.mean(se3.angle(offs) ** 2)) == pytest.approx(np.radians(8), rel=0.1)
     assert np.abs(offs[:, :3, 3].mean(0)).max() < 1e-3
     first, again = (lab.operator_starts(np.random.default_rng(9)) for _ in range(2))

@@ -29,9 +29,8 @@ camera = "D405"
 translation_m = [0.0, -0.065, 0.035]
 rotation_vector_rad = [0.0, 0.0, 0.0]
 """
-TETRAHEDRON = "\n".join(
-    ["v 0 0 0", "v 40 0 0", "v 0 40 0", "v 0 0 40", "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
-)
+NO_TURN = "rotation_vector_rad = [0.0, 0.0, 0.0]"
+TETRAHEDRON = "v 0 0 0\nv 40 0 0\nv 0 40 0\nv 0 0 40\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
 def written(folder: Path, text: str, name: str = "mount.toml") -> Path:
@@ -99,13 +98,9 @@ def test_what_is_written_is_read_back(
         )
         for kind, lengths in kinds.items()
     ]  # fmt: skip
-    mount = Mount(
-        name=name,
-        camera=str(rng.choice(list(CAMERA_BODIES))),
-        T_ee_cam=se3.random_transform(rng, spread=0.05),
-        bracket=tuple(pieces[: rng.integers(0, 6)]),
-        cover_m=float(rng.choice([0.0, 0.004])),
-    )
+    camera, cover_m = str(rng.choice(list(CAMERA_BODIES))), float(rng.choice([0.0, 0.004]))
+    T, bracket = se3.random_transform(rng, spread=0.05), tuple(pieces[: rng.integers(0, 6)])
+    mount = Mount(name=name, camera=camera, T_ee_cam=T, bracket=bracket, cover_m=cover_m)
     folder = tmp_path_factory.mktemp("mount")
     assert same(read_mount(written(folder, text_of(mount, folder))), mount)
 
@@ -119,14 +114,13 @@ def test_three_ways_to_say_the_same_rotation(tmp_path: Path) -> None:
         f"matrix = {np.round(R, 12).tolist()}",
     ]
     for way in ways:
-        path = written(tmp_path, GOOD.replace("rotation_vector_rad = [0.0, 0.0, 0.0]", way))
+        path = written(tmp_path, GOOD.replace(NO_TURN, way))
         assert np.abs(read_mount(path).T_ee_cam[:3, :3] - R).max() < 2e-5
 
 
 def test_without_a_bracket_a_plain_one_is_assumed(tmp_path: Path) -> None:
-    assert same(
-        read_mount(written(tmp_path, GOOD.replace("left bracket", d405_mount().name))), d405_mount()
-    )
+    path = written(tmp_path, GOOD.replace("left bracket", d405_mount().name))
+    assert same(read_mount(path), d405_mount())
     assert read_mount(written(tmp_path, GOOD + "bracket = []\n")).bracket == ()
 
 
@@ -152,13 +146,9 @@ WRONG = {
     "'D450' is not known; there are D405": GOOD.replace('"D405"', '"D450"'),
     "rotation_vector_rad and quaternion_xyzw given; exactly one": GOOD
     + "quaternion_xyzw = [0, 0, 0, 1]",
-    "length 2.0000; 1 is needed": GOOD.replace(
-        "rotation_vector_rad = [0.0, 0.0, 0.0]", "quaternion_xyzw = [0, 0, 0, 2]"
-    ),
+    "length 2.0000; 1 is needed": GOOD.replace(NO_TURN, "quaternion_xyzw = [0, 0, 0, 2]"),
     "Were degrees given": GOOD.replace("rad = [0.0, 0.0, 0.0]", "rad = [0.0, 0.0, 90.0]"),
-    "mirrored": GOOD.replace(
-        "rotation_vector_rad = [0.0, 0.0, 0.0]", "matrix = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]"
-    ),
+    "mirrored": GOOD.replace(NO_TURN, "matrix = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
     "name is missing": GOOD.replace('name = "left bracket"', ""),
     "is not TOML": GOOD + "cover_m = 5 mm",
     "bracket 1: size_m is .* list of 3": GOOD + '[[bracket]]\nkind = "box"\nsize_m = [0.1, 0.1]',
@@ -184,14 +174,13 @@ def test_the_plain_bracket_joins_flange_and_camera(camera: str) -> None:
 
     T = se3.from_translation([-0.09, 0.09, 0.0])
     mount = Mount(name="m", camera=camera, T_ee_cam=T, bracket=plain_bracket(T, camera))
-    chain = [*mount.bracket, camera_shape(mount)]
 
     def gap(a: Shape, b: Shape) -> float:
         request, result = coal.DistanceRequest(), coal.DistanceResult()
         places = [coal.Transform3s(s.T_frame_shape[:3, :3], s.T_frame_shape[:3, 3]) for s in (a, b)]
         return coal.distance(coal_shape(a), places[0], coal_shape(b), places[1], request, result)
 
-    for a, b in pairwise(chain):
+    for a, b in pairwise([*mount.bracket, camera_shape(mount)]):
         assert gap(a, b) <= 1e-6
     assert CollisionModel(UR5, mount, CELL, 0.01).mount_gap_m > 0
 

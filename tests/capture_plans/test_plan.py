@@ -63,9 +63,9 @@ def test_every_move_keeps_the_clearance_on_a_finer_grid_than_planned(plan: Captu
     for k in range(len(plan)):
         corners = plan.move(k)
         samples, _ = interpolate(corners[:-1], corners[1:], plan.config.edge_step_rad / 2)
-        clearance = model.clearance(samples)
+        least = min(d.min() for d in model.clearance(samples).values())
         # Between checked configurations a link moves a few millimetres at most.
-        assert min(d.min() for d in clearance.values()) > plan.config.clearance_m - 0.004
+        assert least > plan.config.clearance_m - 0.004
 
 
 def test_moves_join_up_and_metrics_are_theirs(plan: CapturePlan) -> None:
@@ -75,9 +75,8 @@ def test_moves_join_up_and_metrics_are_theirs(plan: CapturePlan) -> None:
         assert np.array_equal(before[-1], after[0])
     legs = np.concatenate([np.abs(np.diff(c, axis=0)) for c in corners])
     assert plan.metrics["travel_total_rad"] == pytest.approx(legs.sum())
-    assert plan.metrics["seconds"] == pytest.approx(
-        move_seconds(legs.max(1), plan.config.speed, plan.config.acceleration).sum()
-    )
+    seconds = move_seconds(legs.max(1), plan.config.speed, plan.config.acceleration).sum()
+    assert plan.metrics["seconds"] == pytest.approx(seconds)
     assert plan.metrics["colliding_legs"] == 0
 
 
@@ -133,9 +132,8 @@ def test_the_plan_turns_with_the_scene() -> None:
         config = PlanConfig(table_rectangle_m=(-2.0, 2.0, -2.0, 2.0), keep_out_m=(0.01, 0.01, 0.05))
         turned = golden_cap(60, (15.0, 90.0)) @ se3.exp_so3([0.0, 0.0, angle]).T
         poses, item = hemisphere_poses(center, turned, config.radius_m, 6, 0.0)
-        model = CollisionModel(
-            UR5, d405_mount(), config.work_cell(center, "hemisphere"), config.clearance_m
-        )
+        cell = config.work_cell(center, "hemisphere")
+        model = CollisionModel(UR5, d405_mount(), cell, config.clearance_m)
         found = reachable(poses, item, d405_mount().T_ee_cam, model, config.sigma_min)
         counts.append(len(found.joints))
     assert counts[0] == pytest.approx(counts[1], rel=0.01)
@@ -155,11 +153,9 @@ def test_advice_prefers_the_places_that_reach_most() -> None:
 def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
     # A small arm is told nearer places and radii that it reaches.
     says = r"only \d+ are reachable.*for a UR3e .*--center 0\.[23]\d*,0,0\.05"
+    rng, small = np.random.default_rng(0), find_arm("ur3e").chain
     with pytest.raises(DegenerateError, match=says):
-        hemisphere_plan(
-            24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), np.random.default_rng(0),
-            chain=find_arm("ur3e").chain,
-        )  # fmt: skip
+        hemisphere_plan(24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), rng, chain=small)
     with pytest.raises(InputError, match="millimetres"):
         PlanConfig(radius_m=(280.0, 420.0))
 
@@ -167,9 +163,8 @@ def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
 def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> None:
     # A box as high as the nearest views: straight moves across it collide.
     config = replace(scene_plan.config, keep_out_m=(0.16, 0.16, 0.26))
-    model = CollisionModel(
-        UR5, d405_mount(), config.work_cell(CENTER, "hemisphere"), config.clearance_m
-    )
+    cell = config.work_cell(CENTER, "hemisphere")
+    model = CollisionModel(UR5, d405_mount(), cell, config.clearance_m)
     q = scene_plan.joints[model.free(scene_plan.joints)]
     a, b = np.triu_indices(len(q), 1)
     blocked = np.flatnonzero(~model.edges_free(q[a], q[b], config.edge_step_rad))
@@ -207,9 +202,8 @@ def test_an_elbow_is_found_where_the_arm_is_longest(
         other[:, elbow] += step
         lower[:, 1] += step
         assert np.all(lengths(other) < longest)
-        assert np.all(
-            chain.link_frames(lower)[:, -3, 2, 3] < chain.link_frames(tall)[:, -3, 2, 3] + 1e-9
-        )
+        height, most = (chain.link_frames(p)[:, -3, 2, 3] for p in (lower, tall))
+        assert np.all(height < most + 1e-9)
 
 
 @pytest.mark.slow
@@ -293,8 +287,7 @@ def test_colliding_moves_are_gone_round() -> None:
     rows = [0, *free.tolist()]
     bad = {(rows[3], rows[4]), (rows[4], rows[3]), (rows[7], rows[8]), (rows[8], rows[7])}
     path = tour(clusters, CONFIG, np.random.default_rng(0), steps=300, colliding=bad)
-    moves = set(zip([0, *path[:-1].tolist()], path.tolist(), strict=True))
-    assert not moves & bad
+    assert not set(zip([0, *path[:-1].tolist()], path.tolist(), strict=True)) & bad
     plain = tour_seconds(clusters, free, CONFIG)
     assert tour_seconds(clusters, free, CONFIG, bad) == pytest.approx(plain + 2 * 5.0)
     assert plain <= tour_seconds(clusters, path, CONFIG) < plain + 5.0

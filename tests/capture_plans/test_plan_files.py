@@ -115,8 +115,7 @@ def test_degrees_and_millimetres_are_named(tmp_path: Path) -> None:
                 row[3] *= 1000.0
 
     assert "in millimetres; metres" in said_when(millimetres, tmp_path)
-    far = [370.0, 20.0, 50.0]
-    text = said_when(lambda d: d["content"].update(center_world=far), tmp_path)
+    text = said_when(lambda d: d["content"].update(center_world=[370.0, 20.0, 50.0]), tmp_path)
     assert "center_world" in text and "millimetres" in text
 
     def turned(data: dict[str, Any]) -> None:

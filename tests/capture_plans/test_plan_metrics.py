@@ -15,7 +15,6 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from given_plans import plan_through
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5
@@ -31,11 +30,14 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.tour_time import TourTime
 from realsim_capture_plans.planning.view_quality import D405, hole_deg
 from realsim_capture_plans.planning.viewpoints import golden_cap
+from refusals import refused
 
 CENTER = np.array([0.40, 0.05, 0.05])
 CONFIG = PlanConfig()
 LOOKING = np.array([0.0, -1.9, -1.6, -1.2, 1.57, 0.0])
 """The arm bent over the table, the camera looking down."""
+DIVE = LOOKING + np.array([0, -0.9, 0, 0, 0, 0])
+"""The arm in the table."""
 
 
 def plan_of(
@@ -48,10 +50,6 @@ def many(n: int, seed: int = 0, spread: float = 0.35) -> np.ndarray:
     return LOOKING + np.random.default_rng(seed).uniform(-spread, spread, (n, 6))
 
 
-def turned_base(angle: float) -> np.ndarray:
-    return LOOKING + angle * np.eye(6)[0]
-
-
 # --- laws -------------------------------------------------------------------------------------
 
 
@@ -59,13 +57,9 @@ def turned(plan: CapturePlan, angle: float) -> CapturePlan:
     """The same plan with everything turned about the base's axis."""
     spin = se3.exp_so3([0.0, 0.0, angle])
     by = angle * np.eye(6)[0]
-    return replace(
-        plan,
-        home=plan.home + by,
-        joints=plan.joints + by,
-        center_world=spin @ plan.center_world,
-        vias=tuple((k, via + by) for k, via in plan.vias),
-    )
+    center, vias = spin @ plan.center_world, tuple((k, via + by) for k, via in plan.vias)
+    home, joints = plan.home + by, plan.joints + by
+    return replace(plan, home=home, joints=joints, center_world=center, vias=vias)
 
 
 def test_turning_everything_about_the_base_changes_no_coverage() -> None:
@@ -135,8 +129,7 @@ def test_the_tour_s_clock_is_at_every_view_when_it_says_so() -> None:
     # Samples are on the way when they say so, and no farther apart than asked.
     s = tour.samples(0.05)
     assert tour.joints_at(s.time_s) == pytest.approx(s.joints, abs=1e-6)
-    same = np.diff(s.leg) == 0
-    assert np.abs(np.diff(s.joints, axis=0))[same].max() <= 0.05 + 1e-12
+    assert np.abs(np.diff(s.joints, axis=0))[np.diff(s.leg) == 0].max() <= 0.05 + 1e-12
     assert np.all(np.diff(s.time_s) >= -1e-9)
 
 
@@ -173,9 +166,8 @@ def test_what_is_in_the_image_follows_from_the_focal_length() -> None:
 
 
 def test_a_move_through_the_table_is_counted_and_its_depth_told() -> None:
-    q = np.stack([LOOKING, turned_base(0.5)])
-    dive = (LOOKING - 0.9 * np.eye(6)[1])[None]
-    plan = plan_of(q, vias=[(1, dive)])
+    q = np.stack([LOOKING, LOOKING + 0.5 * np.eye(6)[0]])
+    plan = plan_of(q, vias=[(1, DIVE[None])])
     m = plan_metrics(plan)
     assert m["colliding_legs"] >= 1
     assert m["clearance_moves_table_m"] < min(m["clearance_table_m"], plan.config.clearance_m)
@@ -188,11 +180,9 @@ def test_rolls_tilts_and_distances_of_a_board_by_hand() -> None:
     plan = looking_down(0.3)
     # The last wrist joint turns the camera about the flange; here only about its optical axis.
     rolls = np.radians([0.0, 90.0, 200.0])
-    T_ee_cam = plan.mount.T_ee_cam
-    views = [plan.Ts_base_cam[0] @ se3.exp(np.array([0, 0, r, 0, 0, 0])) for r in rolls]
-    joints = np.concatenate(
-        [UR5.inverse_branches((T @ se3.invert(T_ee_cam))[None])[0][:1] for T in views]
-    )
+    back = se3.invert(plan.mount.T_ee_cam)
+    hands = [plan.Ts_base_cam[0] @ se3.exp(np.array([0, 0, r, 0, 0, 0])) @ back for r in rolls]
+    joints = np.concatenate([UR5.inverse_branches(T[None])[0][:1] for T in hands])
     board = replace(plan, kind="calibration", joints=joints)
     m = plan_metrics(board)
     assert m["roll_gap_deg"] == pytest.approx(160.0, abs=1e-5)
@@ -203,8 +193,7 @@ def test_rolls_tilts_and_distances_of_a_board_by_hand() -> None:
     # The optical axis meets the board at the centre, however the board is tipped.
     assert tipped["distance_max_m"] == pytest.approx(0.3, abs=1e-6)
     assert "hole_deg" not in m
-    with pytest.raises(InputError, match="normal"):
-        plan_metrics(board, board_normal=(0.0, 0.0, 0.0))
+    refused("normal", plan_metrics, board, board_normal=(0.0, 0.0, 0.0))
 
 
 # --- the table of meanings --------------------------------------------------------------------
@@ -221,11 +210,8 @@ def test_every_metric_has_a_meaning_and_a_finite_value(kind: str) -> None:
 
 # --- Pictures of plans: what they draw is what the plan says, and they can be read.
 
-"""The arm bent over the table, the camera looking down."""
-N = 30
 
-
-def make(kind: Any = "hemisphere", n: int = N, config: PlanConfig | None = None) -> CapturePlan:
+def make(kind: Any = "hemisphere", n: int = 30, config: PlanConfig | None = None) -> CapturePlan:
     rng = np.random.default_rng(0)
     joints = LOOKING + rng.uniform(-0.35, 0.35, (n, 6))
     vias = ((5, LOOKING + rng.uniform(-0.3, 0.3, (2, 6))),) if n > 5 else ()
@@ -255,9 +241,7 @@ def test_a_handful_of_pictures_is_written_and_nothing_else(tmp_path: Path) -> No
     paths = plan_pictures(make(n=3), tmp_path / "pictures")
     names = ["coverage", "arm", "joints", "clearance", "views"]
     assert [p.stem for p in paths] == names
-    assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == sorted(
-        f"{name}.png" for name in names
-    )
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.png" for n in names}
     for path in paths:
         with Image.open(path) as image:
             assert min(image.size) > 500
@@ -298,8 +282,7 @@ def test_the_clearance_picture_names_the_worst_spot_of_every_group(curves: PlanC
 
 def test_a_plan_that_does_not_keep_its_clearance_is_said_not_to_be_driven() -> None:
     plan = make()
-    dive = (LOOKING - 0.9 * np.eye(6)[1])[None]
-    broken = PlanCurves.of(replace(plan, vias=((3, dive),)))
+    broken = PlanCurves.of(replace(plan, vias=((3, DIVE[None]),)))
     shown = texts(clearance_chart(broken))
     assert "NOT KEPT" in shown and "move to view 3" in shown
     safe = PlanCurves.of(replace(plan, joints=LOOKING[None] + [[0.3, 0, 0, 0, 0, 0]], vias=()))
@@ -317,8 +300,6 @@ def test_the_board_picture_shows_rolls_tilts_and_places_in_the_image() -> None:
 
 
 # --- The replay in the browser: it listens only here, and draws what the plan does.
-DIVE = LOOKING + np.array([0, -0.9, 0, 0, 0, 0])
-"""The arm in the table."""
 SHOWN = 8
 
 
@@ -331,12 +312,8 @@ def replay() -> Iterator[PlanReplay]:
 
 def arm_poses(replay: PlanReplay) -> np.ndarray:
     """What the browsers are told: (7, 4, 4)."""
-    return np.stack(
-        [
-            se3.from_rt(se3.from_quaternion_wxyz(f.wxyz), f.position)
-            for f in replay.scene._frames  # type: ignore[reportPrivateUsage]
-        ]
-    )
+    frames = replay.scene._frames  # type: ignore[reportPrivateUsage]
+    return np.stack([se3.from_rt(se3.from_quaternion_wxyz(f.wxyz), f.position) for f in frames])
 
 
 # --- who may look -----------------------------------------------------------------------------
@@ -351,8 +328,7 @@ def test_it_answers_on_this_machine(replay: PlanReplay) -> None:
 
 def test_a_host_that_others_reach_is_refused() -> None:
     for host in ("0.0.0.0", "::", "lab-pc"):
-        with pytest.raises(InputError, match=r"no login.*ssh -L"):
-            PlanReplay(make(n=SHOWN), host=host, port=0)
+        refused(r"no login.*ssh -L", PlanReplay, make(n=SHOWN), host=host, port=0)
 
 
 def test_a_foreign_page_cannot_connect(replay: PlanReplay) -> None:
@@ -406,9 +382,8 @@ def test_the_file_holds_the_whole_tour(tmp_path: Path) -> None:
     found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', path.read_text())
     assert found
     data = base64.b64decode(found[1])
-    inner = zstandard.ZstdDecompressor().decompress(
-        data[8:], max_output_size=int.from_bytes(data[:8], "little")
-    )
+    size = int.from_bytes(data[:8], "little")
+    inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=size)
     content = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
     assert content["durationSeconds"] > 1.0
     hand = [

@@ -199,10 +199,9 @@ def test_a_stream_that_the_device_lacks_is_named(make: Make, opened: Open) -> No
 
 
 def test_distortion_models(rs: Any) -> None:
-    brown = intrinsics_of(
-        raw_intrinsics(rs, rs.distortion.brown_conrady, [0.1, -0.2, 1e-3, 2e-3, 0.05])
-    )
-    assert brown.distortion == pytest.approx([0.1, -0.2, 1e-3, 2e-3, 0.05, 0, 0, 0], abs=1e-7)
+    terms = [0.1, -0.2, 1e-3, 2e-3, 0.05]
+    brown = intrinsics_of(raw_intrinsics(rs, rs.distortion.brown_conrady, terms))
+    assert brown.distortion == pytest.approx([*terms, 0, 0, 0], abs=1e-7)
     inverse = rs.distortion.inverse_brown_conrady
     assert not intrinsics_of(raw_intrinsics(rs, inverse, [0.0] * 5)).is_distorted
     with pytest.raises(InputError, match="inverse_brown_conrady"):

@@ -84,9 +84,8 @@ def test_arrives_where_it_is_sent_whatever_the_tool(cb3: LoopbackController) -> 
             arm.move(goal, speed=2.0, acceleration=3.0)
             state = arm.state()
             np.testing.assert_allclose(state.joints, goal, atol=1e-12)
-            np.testing.assert_allclose(
-                state.T_base_ee, known_chains()[robot].forward(goal), atol=1e-12
-            )
+            flange = known_chains()[robot].forward(goal)
+            np.testing.assert_allclose(state.T_base_ee, flange, atol=1e-12)
             np.testing.assert_allclose(state.T_ee_tcp, T_from_rotation_vector_pose(TCP))
             times.append(state.time_s)
     assert np.all(np.diff(times) > 0)
@@ -219,16 +218,15 @@ def test_after_a_killed_capture_the_arm_stands_and_the_next_one_goes_on(
         "arm = UrArm(sys.argv[1]); print('moving', flush=True)\n"
         "arm.move(arm.state().joints + 1.5, speed=0.05)\n"
     )
-    capture = subprocess.Popen(
-        [sys.executable, "-c", code, controller.host], stdout=subprocess.PIPE
-    )
+    command = [sys.executable, "-c", code, controller.host]
+    capture = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert capture.stdout is not None and capture.stdout.readline() == b"moving\n"
     time.sleep(0.3)
     workers = children(capture.pid)
     capture.kill()
     capture.wait()
     end = time.monotonic() + 30.0
-    while any(Path(f"/proc/{p}/cmdline").exists() and command_line(p) for p in workers):
+    while any(command_line(p) for p in workers):
         assert time.monotonic() < end, "ur_rtde's process outlives its capture"
         time.sleep(0.02)
     stands = np.array(controller.joints())
@@ -300,6 +298,7 @@ def children(pid: int) -> list[int]:
 
 
 def command_line(pid: int) -> bytes:
+    """Return how a process was called; empty once it has ended, waited for or not."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -339,9 +338,8 @@ def test_a_motion_keeps_its_line_and_its_limits(
     share = (q - HOME) @ way / (way @ way)
     np.testing.assert_allclose(q, HOME + share[:, None] * way, atol=1e-12)
     # The reported speed is the derivative of the reported place.
-    np.testing.assert_allclose(
-        np.diff(q, axis=0), 0.5 * STEP * (v[1:] + v[:-1]), atol=acceleration * STEP**2
-    )
+    driven = 0.5 * STEP * (v[1:] + v[:-1])
+    np.testing.assert_allclose(np.diff(q, axis=0), driven, atol=acceleration * STEP**2)
 
     # Both wait 0.5 s and more when they are closed: the controller's end is quicker.
 
@@ -354,10 +352,9 @@ def test_ends_with_its_parent() -> None:
         "os.kill(os.getpid(), 9)\n"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).stdout
-    pids = [int(word) for word in said.split()]
-    assert len(pids) == 1
+    (pid,) = [int(word) for word in said.split()]
     end = time.monotonic() + 30.0
-    while any(_runs(pid) for pid in pids):
+    while command_line(pid):
         assert time.monotonic() < end, "a loopback controller outlives its parent"
         time.sleep(0.02)
 
@@ -390,10 +387,3 @@ def test_the_dashboards_model_name_needs_the_series(
     says: str | None, major: int, model: str | None
 ) -> None:
     assert detected_model(says, major) == model
-
-
-def _runs(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
