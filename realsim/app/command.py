@@ -18,13 +18,24 @@ ENVIRONMENT = "REALSIM"
 """Begins the names of all variables: REALSIM_SCHOOL_RUN_FORCE is --force of `school run`."""
 
 
-class Command(click.Command):
-    """A command whose help ends with examples."""
+class Exemplified(click.Command):
+    """A command or group whose help ends with examples."""
 
     def __init__(self, name: str | None, *, examples: Sequence[str] = (), **attrs: Any) -> None:
         """Take click's arguments and the examples: lines that begin with `realsim`."""
         super().__init__(name, **attrs)
         self.examples = tuple(examples)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples as they are typed, unwrapped."""
+        super().format_epilog(ctx, formatter)
+        if self.examples:
+            with formatter.section("Examples"):
+                formatter.write("".join(f"  {line}\n" for line in self.examples))
+
+
+class Command(Exemplified):
+    """A command that takes its old names, and names the variable that gave a wrong value."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the arguments; a value that a variable gave is refused with the variable's name."""
@@ -49,36 +60,25 @@ class Command(click.Command):
             told = f"{error.message} The variable {option.envvar} says so."
             raise click.BadParameter(told, ctx=ctx, param=option) from error
 
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the examples as they are typed, unwrapped."""
-        super().format_epilog(ctx, formatter)
-        write_examples(self.examples, formatter)
 
-
-class Group(click.Group):
+class Group(Exemplified, click.Group):
     """A group whose commands are imported when they are asked for."""
 
     def __init__(
         self,
-        name: str | None = None,
-        *,
-        late: Mapping[str, str] | None = None,
-        examples: Sequence[str] = (),
-        by_default: str | None = None,
-        **attrs: Any,
-    ) -> None:
+        name: str | None = None, *, late: Mapping[str, str] | None = None,
+        by_default: str | None = None, **attrs: Any,
+    ) -> None:  # fmt: skip
         """Take click's arguments, and the commands that are loaded late.
 
         Args:
             name: of the group.
             late: `module:attribute` of a command by its name, in the order of the help.
-            examples: lines of the help.
             by_default: the command that needs no name: `realsim school SESSION` runs `run`.
-            attrs: click's.
+            attrs: click's, and the examples.
         """
         super().__init__(name, **attrs)
-        self.late = dict(late or {})
-        self.examples, self.by_default = tuple(examples), by_default
+        self.late, self.by_default = dict(late or {}), by_default
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put the default command before arguments that begin with none and ask for no help."""
@@ -131,18 +131,6 @@ class Group(click.Group):
         if rows:
             with formatter.section("Commands"):
                 formatter.write_dl(rows)
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the examples as they are typed, unwrapped."""
-        super().format_epilog(ctx, formatter)
-        write_examples(self.examples, formatter)
-
-
-def write_examples(examples: Sequence[str], formatter: click.HelpFormatter) -> None:
-    """Write the block of examples, if there are any."""
-    if examples:
-        with formatter.section("Examples"):
-            formatter.write("".join(f"  {line}\n" for line in examples))
 
 
 def old_names(command: click.Command, path: Sequence[str]) -> dict[str, str]:

@@ -21,10 +21,10 @@ Sliders, layers and sheets share a budget: where not all views fit, views spread
 and the page says how many. Plots are drawn in one style with `realsim.pages.plots`.
 """
 
-from realsim.pages.page import BUDGET_BYTES, VERDICT_KIND, Cell, Page, template
+from realsim.pages.page import BUDGET_BYTES, VERDICT_KIND, Cell, Page, counted, template
 from realsim.pages.pictures import Picture, View, jpeg_bytes, spread
 
 __all__ = [
     "BUDGET_BYTES", "VERDICT_KIND", "Cell", "Page", "Picture", "View",
-    "jpeg_bytes", "spread", "template",
+    "counted", "jpeg_bytes", "spread", "template",
 ]  # fmt: skip

@@ -48,6 +48,11 @@ class Cell:
         return self.text
 
 
+def counted(n: int, what: str) -> str:
+    """Return a number of things in words: 1 view, 2 views."""
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
 def _cells(row: Sequence[object]) -> list[Cell]:
     return [c if isinstance(c, Cell) else Cell(str(c)) for c in row]
 

@@ -91,7 +91,7 @@ def shown(picture: Picture, alt: str, quality: int = QUALITY, label: str = "") -
         InputError: it is no picture.
     """
     if isinstance(picture, bytes):
-        return Shown(src=_data_url(picture), alt=alt, label=label)
+        return Shown(src=data_url(picture), alt=alt, label=label)
     image = np.asarray(picture() if callable(picture) else picture)
     if image.ndim not in (2, 3) or image.dtype != np.uint8 or image.size == 0 or (
         image.ndim == 3 and image.shape[2] != 3
@@ -103,11 +103,12 @@ def shown(picture: Picture, alt: str, quality: int = QUALITY, label: str = "") -
     if image.shape[1] > WIDTH_PX:
         image = resized(image, WIDTH_PX)
     height, width = image.shape[:2]
-    src = _data_url(jpeg_bytes(image, quality))
+    src = data_url(jpeg_bytes(image, quality))
     return Shown(src=src, alt=alt, label=label, size=(width, height))
 
 
-def _data_url(data: bytes) -> Markup:
+def data_url(data: bytes) -> Markup:
+    """Return a PNG or JPEG as it stands inside a page."""
     form = "jpeg" if data[:2] == b"\xff\xd8" else "png"
     return Markup(f"data:image/{form};base64,{base64.b64encode(data).decode()}")
 

@@ -13,6 +13,7 @@ from realsim import __version__
 from realsim.app.console import shortened
 from realsim.app.stages import changed_fields
 from realsim.formats.labelled_scene import WrittenScene
+from realsim.pages import counted
 
 CARD_FILE = "README.md"
 NOT_STATED = "not stated: ask the source before publishing"
@@ -30,6 +31,10 @@ SIZES = (
     (10_000_000, "1M<n<10M"),
 )  # fmt: skip
 """Hugging Face's size categories, by the number of frames."""
+
+
+MOST_NOTES = 60
+"""Notes that a card has; the rest is counted."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -110,11 +115,8 @@ def card_bytes(card: DatasetCard) -> bytes:
     parts.append(_section("Loading", f"```python\n{card.loading.strip()}\n```\n"))
     parts.append(_section("Licence", _licence(card)))
     parts.append(_section("Made with", _made_with(card)))
-    parts.append(
-        _section(
-            "Checksums", "`sha256sum -c SHA256SUMS` compares every file with what was written.\n"
-        )
-    )
+    sums = "`sha256sum -c SHA256SUMS` compares every file with what was written.\n"
+    parts.append(_section("Checksums", sums))
     return "\n".join(parts).encode("utf-8")
 
 
@@ -139,15 +141,11 @@ def _licence_fields(licence: str) -> dict[str, str]:
 
 
 def _summary(card: DatasetCard, frames: int) -> str:
-    scenes = len(card.scenes)
-    objects = sum(s.written.objects for s in card.scenes)
-    return (
-        f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} frames, {objects} object poses "
-        f"in them, {len(card.objects)} object models. Format: {card.format}.\n"
-        if card.objects
-        else f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} frames. Format: "
-        f"{card.format}.\n"
-    )
+    text = f"{counted(len(card.scenes), 'scene')}, {frames} frames"
+    if card.objects:
+        objects = sum(s.written.objects for s in card.scenes)
+        text += f", {objects} object poses in them, {len(card.objects)} object models"
+    return f"{text}. Format: {card.format}.\n"
 
 
 def _section(title: str, body: str) -> str:
@@ -156,9 +154,8 @@ def _section(title: str, body: str) -> str:
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     def line(cells: Sequence[object]) -> str:
-        return (
-            "| " + " | ".join(str(c).replace("|", r"\|").replace("\n", " ") for c in cells) + " |"
-        )
+        escaped = [str(c).replace("|", r"\|").replace("\n", " ") for c in cells]
+        return f"| {' | '.join(escaped)} |"
 
     return "\n".join([line(header), line(["---"] * len(header)), *(line(r) for r in rows)]) + "\n"
 
@@ -210,8 +207,8 @@ def _listed(title: str, lines: Sequence[str]) -> str:
     return f"\n{title}:\n\n{_joined(lines)}\n" if lines else ""
 
 
-def _joined(notes: Sequence[str], most: int = 60) -> str:
-    return "\n".join(shortened(list(dict.fromkeys(notes)), most, "- and {} more notes."))
+def _joined(notes: Sequence[str]) -> str:
+    return "\n".join(shortened(list(dict.fromkeys(notes)), MOST_NOTES, "- and {} more notes."))
 
 
 def _licence(card: DatasetCard) -> str:

@@ -28,6 +28,10 @@ RESULTS_VERSION = 3
 """Raised whenever the same request gives other scenes."""
 
 
+Files = tuple[tuple[Path | None, ...], tuple[Path, ...], tuple[Path, ...]]
+"""What a request reads: see `GenerateRequest.with_files`."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GenerateRequest:
     """What every scene of a data set depends on, besides its number."""
@@ -53,11 +57,11 @@ class GenerateRequest:
         }))  # fmt: skip
         return values
 
-    def carried(self) -> tuple[Any, ...]:
-        """Return the request and its files as they travel to another machine, see `with_files`."""
+    def files(self) -> tuple[Any, ...]:
+        """Return the files as they travel to another machine, where they are `Files`."""
         folders = (None if s.kind == PYBULLET else Sent(s.folder) for s in self.pool.sources)
         looks = (tuple(map(Sent, self.looks.hdris)), tuple(map(Sent, self.looks.textures)))
-        return self, tuple(folders), *looks
+        return tuple(folders), *looks
 
     def with_files(
         self, folders: tuple[Path | None, ...], hdris: tuple[Path, ...], textures: tuple[Path, ...]
@@ -200,17 +204,6 @@ def _require_panorama(path: Path) -> None:
                 "as high (such as 2048x1024), is accepted. Cube maps and mirror balls must be "
                 "converted first."
             )
-
-
-def made_folder(out: Path) -> None:
-    """Make the folder of a data set if it is not there.
-
-    Raises:
-        InputError: a file is in its place.
-    """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"'{out}' is a file; give a folder that may be made or filled.")
-    out.mkdir(parents=True, exist_ok=True)
 
 
 def claim(out: Path, request: GenerateRequest) -> None:

@@ -11,13 +11,9 @@ from typing import Any
 
 from realsim import many
 from realsim.app.console import Console, cpu_seconds
-from realsim.app.generate.request import (
-    LAYOUTS,
-    GenerateRequest,
-    claim,
-    made_folder,
-    require_usable,
-)
+from realsim.app.generate.request import LAYOUTS, Files, GenerateRequest, claim, require_usable
+from realsim.errors import InputError
+from realsim.pages import counted
 from realsim.store import SessionStore, atomic
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import noted, read_object
@@ -77,13 +73,16 @@ def is_finished(out: Path, number: int, request: GenerateRequest) -> bool:
     return labelled and SessionStore.open(folder).completed >= set(views)
 
 
-def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 1) -> SceneCosts:
+def make_scene(
+    out: Path, number: int, request: GenerateRequest, files: Files | None = None, workers: int = 1
+) -> SceneCosts:
     """Make a scene, or what is missing of it.
 
     Args:
         out: folder of the data set.
         number: of the scene.
         request: what is wanted.
+        files: the request's, where they lie elsewhere than it says.
         workers: processes that render its views.
 
     Raises:
@@ -92,6 +91,8 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
     """
     began = cpu_seconds()
     cache = out / CACHE
+    if files is not None:
+        request = request.with_files(*files)
     if layout_path(out, number).is_file():
         layout = load_layout(out, number)
     else:
@@ -128,22 +129,6 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
     return costs
 
 
-def make_scene_of(
-    out: Path,
-    number: int,
-    request: GenerateRequest,
-    folders: tuple[Path | None, ...],
-    hdris: tuple[Path, ...],
-    textures: tuple[Path, ...],
-    workers: int,
-) -> SceneCosts:
-    """Make a scene, or what is missing of it, where files may lie elsewhere than the request says.
-
-    Arguments as of `GenerateRequest.with_files` and `make_scene`.
-    """
-    return make_scene(out, number, request.with_files(folders, hdris, textures), workers)
-
-
 def stored_costs(out: Path, number: int) -> dict[str, Any]:
     """Return what the run that finished a scene spent on it; empty where that is not known."""
     path = finished_path(out, number)
@@ -177,7 +162,9 @@ def generate(
     """
     require_renderer(request.rendering)
     require_usable(request)
-    made_folder(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file; give a folder that may be made or filled.")
+    out.mkdir(parents=True, exist_ok=True)
     with only_run_in(out):
         claim(out, request)
         kept = [k for k in range(scenes) if is_finished(out, k, request)]
@@ -185,8 +172,7 @@ def generate(
         pool = many.at_most(where, len(due))
         # Scenes fewer than workers: the rest help with the views.
         each = 1 if where.address else max(1, where.processes // pool.processes)
-        plural = "" if scenes == 1 else "s"
-        what = f"{scenes} scene{plural} of {request.views.count} views"
+        what = f"{counted(scenes, 'scene')} of {request.views.count} views"
         with console.stage("generate", what) as tick:
             count = _ticker(out, scenes, request.views.count, tick)
             made, failed = _made(out, due, request, pool, each, count)
@@ -244,7 +230,7 @@ def scene_tasks(
     for k in due:
         name = scene_name(k)
         own = many.Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
-        yield many.Task(name=name, fn=make_scene_of, args=(own, k, *request.carried(), workers))
+        yield many.Task(name=name, fn=make_scene, args=(own, k, request, request.files(), workers))
 
 
 def _ticker(

@@ -12,6 +12,7 @@ from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome, is_finished, load_layout, stored_costs
 from realsim.errors import InputError
 from realsim.formats.folders.listing import shown
+from realsim.pages import counted
 from realsim.store import provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.sample import Layout
@@ -205,9 +206,9 @@ def tables_of(out: Path, dataset: dict[str, Any]) -> list[FiguresTable]:
 def summary_of(dataset: dict[str, Any]) -> str:
     """Return a data set in one line."""
     s = dataset["statistics"]
-    tables = f"{len(s['tables'])} kind{'' if len(s['tables']) == 1 else 's'} of tables"
+    tables = f"{counted(len(s['tables']), 'kind')} of tables"
     return (
-        f"{s['scenes']} scene{'' if s['scenes'] == 1 else 's'}, {s['views']} views, "
+        f"{counted(s['scenes'], 'scene')}, {s['views']} views, "
         f"{s['instances']} objects of {s['distinct_objects']} kinds on {tables}; "
         f"{s['fell_off']} fell off, {s['overhung']} hung over the rim, {s['restless']} never "
         f"rested, {s['skipped_meshes']} meshes could not be used."

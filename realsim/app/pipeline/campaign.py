@@ -107,27 +107,18 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         for name in ("generate", "import", *OF_A_SCENE, "stats")
     }
     _require_used(file, tables | ({"export": exports} if exports else {}), stages, source)
-    of_all = [
-        step
-        for name in stages
-        if name in OF_ALL
-        for step in (
-            [_step(file, root, commands, {"export": each}, name) for each in several]
-            if name == "export"
-            else [steps[name]]
-        )
+    exported = "export" in stages
+    writing = [
+        _step(file, root, commands, {"export": each}, "export") for each in several if exported
     ]
-    if "export" in stages and not all(isinstance(e, dict) and "to" in e for e in several):
+    if exported and not all(isinstance(e, dict) and "to" in e for e in several):
         raise InputError(
             f"{file.place(('export',))}: an [export] needs `to`, the format to write, such as "
             'to = "bop"; `realsim export --help` lists them.'
         )
     if len(several) > 1:
-        numbers = iter(range(1, len(several) + 1))
-        of_all = [
-            replace(s, stage=f"export_{next(numbers)}") if s.stage == "export" else s
-            for s in of_all
-        ]
+        writing = [replace(s, stage=f"export_{k}") for k, s in enumerate(writing, 1)]
+    over_all = {"export": writing, "stats": [steps["stats"]]}
     first = {"generate": steps["generate"], "sources": steps["import"]}.get(source)
     return Campaign(
         file=path,
@@ -136,7 +127,7 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         places=tuple(_places(file, head.get(source, []), source)),
         first=first,
         of_a_scene=tuple(steps[name] for name in stages if name in OF_A_SCENE),
-        of_all=tuple(of_all),
+        of_all=tuple(step for name in stages for step in over_all.get(name, ())),
         scenes=_count(steps["generate"]) if source == "generate" else None,
     )
 

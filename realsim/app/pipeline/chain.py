@@ -166,18 +166,21 @@ def child() -> None:
     main()
 
 
+def _tail(written: BinaryIO, start: int) -> str:
+    written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
+    return written.read().decode("utf-8", "replace")
+
+
 def _notes(written: BinaryIO, start: int) -> tuple[str, ...]:
     """Return the first notes of a command, of each that is said of several scenes one."""
-    written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
-    lines = written.read().decode("utf-8", "replace").splitlines()
+    lines = _tail(written, start).splitlines()
     notes = [x[len(NOTE) : WORDS] for x in lines if x.startswith(NOTE)]
     return tuple({n.partition(": ")[2]: n for n in reversed(notes)}.values())[::-1][:MOST_NOTES]
 
 
 def _last_words(written: BinaryIO, start: int, code: int) -> str:
     """Return why a command failed, in its own words."""
-    written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
-    lines = written.read().decode("utf-8", "replace").strip().splitlines()
+    lines = _tail(written, start).strip().splitlines()
     errors = [k for k, line in enumerate(lines) if line.lower().startswith("error: ")]
     told = " ".join(lines[errors[-1] if errors else -1 :])
     told = told[len("error: ") :] if errors else told

@@ -8,10 +8,10 @@ import numpy as np
 
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import MEDIAN_SCATTER, Figure, count, mean_error, shown
-from realsim.app.report.section import Section, attempted, counted, drawn
+from realsim.app.report.section import Section, attempted, drawn
 from realsim.app.stages import BOARD_VIEWS
 from realsim.arrays import Array
-from realsim.pages import Cell
+from realsim.pages import Cell, counted
 from realsim.records import Check, HandEye
 from realsim.records.calibration import worst_first
 from realsim.store import SessionStore

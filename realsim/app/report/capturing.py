@@ -7,8 +7,9 @@ import numpy as np
 
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.section import READING, Section, attempted, counted, drawn
+from realsim.app.report.section import READING, Section, attempted, drawn
 from realsim.arrays import evenly
+from realsim.pages import counted
 from realsim.store import SessionStore
 from realsim.store.atomic import complete_lines
 

@@ -143,15 +143,13 @@ def object_differences(first: Source, second: Source) -> list[ObjectDifference]:
     # Ordered by both numbers: which session is named first must not change the order.
     found = [_pair(a[i], b[k], first, second) for i, k in sorted(pairs.items(), key=sorted)]
     alone = [
-        ObjectDifference(name=_name(o), first=o, second=None, note=f"only in {first.letter}")
-        for i, o in sorted(a.items())
-        if i not in pairs
+        ObjectDifference(name=_name(a[i]), first=a[i], second=None, note=f"only in {first.letter}")
+        for i in a.keys() - pairs.keys()
     ] + [
-        ObjectDifference(name=_name(o), first=None, second=o, note=f"only in {second.letter}")
-        for i, o in sorted(b.items())
-        if i not in pairs.values()
+        ObjectDifference(name=_name(b[i]), first=None, second=b[i], note=f"only in {second.letter}")
+        for i in b.keys() - pairs.values()
     ]
-    return found + sorted(alone, key=lambda d: d.name)
+    return found + sorted(alone, key=lambda d: (d.name, d.note))
 
 
 def _name(row: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.app.report import compare
 from realsim.app.report.figures import CATALOGUE, figures_to_json
-from realsim.app.report.sources import Source
+from realsim.app.report.sources import SERIES_BY_VIEW, Source
 from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
 from realsim.pages import Cell, Page, plots
 
@@ -253,50 +253,27 @@ SHARES = (
 
 def overlaid(sessions: Series) -> Iterator[tuple[bytes, str]]:
     """Return every plot that two sessions at least have something for."""
-    for name, title, x, y in BY_VIEW:
-        mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if _views(s, name)]
-        if len(mine) > 1:
-            figure, ax = plots.axes(title, x, y)
-            for label, values, k in mine:
-                style = {
-                    "color": plots.SERIES[k % 6],
-                    "marker": plots.MARKERS[k % 6],
-                    "ls": plots.STYLES[k % 6],
-                }
-                # The first ones larger: equal values would hide them.
-                size = max(3, 7 - 2 * k)
-                ax.plot(values["view"], values["value"], ms=size, lw=1, label=label, **style)
-            ax.set_ylim(0, 1.3 * max(ax.get_ylim()[1], 1e-9))
-            plots.whole_numbers(ax.xaxis)
-            plots.legend(ax, loc="upper left", ncols=2)
-            yield (plots.png(figure), f"{title}: {_labels(mine)}.")
-    for name, title, x, y in SHARES:
+    for name, title, x, y in (*BY_VIEW, *SHARES):
+        by_view = name in SERIES_BY_VIEW
         mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if s.get(name)]
-        if len(mine) > 1:
-            figure, ax = plots.axes(title, x, y)
-            edges = np.linspace(0, 1, 21)
-            for label, values, k in mine:
-                counts, _ = np.histogram(values, edges)
-                share = 100 * counts / len(values)
-                ax.stairs(
-                    share,
-                    edges,
-                    color=plots.SERIES[k % 6],
-                    ls=plots.STYLES[k % 6],
-                    lw=2,
-                    label=label,
-                )
-            ax.set_ylim(0, 1.25 * max(ax.get_ylim()[1], 1e-9))
-            plots.legend(ax, loc="upper left", ncols=2)
-            yield (plots.png(figure), f"{title}: {_labels(mine)}.")
-
-
-def _views(series: Mapping[str, Any], name: str) -> bool:
-    return bool(series.get(name, {}).get("view"))
-
-
-def _labels(mine: Sequence[tuple[str, Any, int]]) -> str:
-    return ", ".join(label for label, _, _ in mine)
+        mine = [m for m in mine if not by_view or m[1].get("view")]
+        if len(mine) < 2:
+            continue
+        figure, ax = plots.axes(title, x, y)
+        for label, values, k in mine:
+            style = {"color": plots.SERIES[k % 6], "ls": plots.STYLES[k % 6], "label": label}
+            if by_view:
+                # The first ones larger: equal values would hide them.
+                style |= {"marker": plots.MARKERS[k % 6], "ms": max(3, 7 - 2 * k), "lw": 1}
+                ax.plot(values["view"], values["value"], **style)
+            else:
+                counts, edges = np.histogram(values, np.linspace(0, 1, 21))
+                ax.stairs(100 * counts / len(values), edges, lw=2, **style)
+        ax.set_ylim(0, (1.3 if by_view else 1.25) * max(ax.get_ylim()[1], 1e-9))
+        if by_view:
+            plots.whole_numbers(ax.xaxis)
+        plots.legend(ax, loc="upper left", ncols=2)
+        yield (plots.png(figure), f"{title}: {', '.join(label for label, _, _ in mine)}.")
 
 
 def moves(objects: Sequence[compare.ObjectDifference], labels: str) -> bytes | None:

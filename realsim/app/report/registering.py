@@ -12,8 +12,8 @@ from realsim.app.register.results import Registered, is_same_pose, load_register
 from realsim.app.register.uncertainty import sigmas
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.section import Section, counted, drawn
-from realsim.pages import VERDICT_KIND, Cell
+from realsim.app.report.section import Section, drawn
+from realsim.pages import VERDICT_KIND, Cell, counted
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.judging.verdict import ACCEPT
 from realsim.review.corrections import decision_on

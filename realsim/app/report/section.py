@@ -80,11 +80,6 @@ class Section:
         self.page.text(f"A file of this stage cannot be read: {told}{again}", "note")
 
 
-def counted(n: int, what: str) -> str:
-    """Return a number of things in words: 1 view, 2 views."""
-    return f"{n} {what}" if n == 1 else f"{n} {what}s"
-
-
 def words_of(error: Exception) -> str:
     """Return in words what is wrong with a file."""
     if isinstance(error, RealsimError):

@@ -26,13 +26,13 @@ from realsim.app.report.capturing import capture_section, plan_section
 from realsim.app.report.figures import MEDIAN_SCATTER, Figure, count, mean_error, share
 from realsim.app.report.labelling import labels_section
 from realsim.app.report.registering import registration_section
-from realsim.app.report.section import READING, Pictures, Section, attempted, built, counted, drawn
+from realsim.app.report.section import READING, Pictures, Section, attempted, built, drawn
 from realsim.app.report.summary import Report, truth_section, write_summary
 from realsim.app.reviewed import review_of
 from realsim.app.school.tables import p_hold_line, school_table, why_no_grasp
 from realsim.app.truth import LoopErrors
 from realsim.formats.grasps.scene_grasps import labelled
-from realsim.pages import Cell, Page, Picture
+from realsim.pages import Cell, Page, Picture, counted
 from realsim.records import GraspSet
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState, read, replay
 from realsim.store import SessionStore

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
-from realsim.app.report.section import counted
 from realsim.app.upgrade import tables
 from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
 from realsim.app.upgrade.scene import Record
 from realsim.arrays import Image, Int32
-from realsim.pages import Page, View
+from realsim.pages import Page, View, counted
 from realsim.records import ObjectModel
 from realsim.rendering.overlay import VERDICT_RGB, draw_outlines
 from realsim.rendering.rays import PlacedMesh

@@ -57,11 +57,8 @@ class SceneConsole(Console):
     @contextmanager
     def stage(self, name: str, note: str = "") -> Generator[Tick]:
         """Show a stage."""
-        with (
-            super().stage(name, note)
-            if self._shown is None
-            else self._shown.stage(name, note) as tick
-        ):
+        stage = super().stage if self._shown is None else self._shown.stage
+        with stage(name, note) as tick:
             yield tick
 
     def say(self, *texts: str) -> None:

@@ -9,7 +9,6 @@ load anything from anywhere, so that nothing in it can.
 The words of the static page.
 """
 
-import base64
 import html
 import json
 from collections.abc import Callable
@@ -27,7 +26,8 @@ from realsim.arrays import Array, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
-from realsim.pages.page import Page, template
+from realsim.pages.page import Page, counted, template
+from realsim.pages.pictures import data_url
 from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import VERDICT_RGB
@@ -53,9 +53,9 @@ def counts_words(content: SceneContent, scene: Scene, state: ReviewState) -> str
     """Return the line under the title: scene, verdicts, reviewers, views."""
     found = {v: sum(o.verdict == v for o in scene.objects) for v in VERDICT_ORDER}
     verdicts = ", ".join(f"{n} {v}" for v, n in found.items() if n)
-    count = _counted(len(scene.objects), "object")
+    count = counted(len(scene.objects), "object")
     words = [scene.name, f"{count}: {verdicts}" if verdicts else count]
-    words.append(_counted(len(content.views), "view"))
+    words.append(counted(len(content.views), "view"))
     excluded = len(state.excluded_views())
     if excluded:
         words[-1] += f" ({excluded} left out by the reviewers)"
@@ -120,10 +120,6 @@ def sigma_rows(placed: ObjectPose, model: ObjectModel) -> list[tuple[str, str]]:
 
 def _said(text: str) -> str:
     return one_line(text).strip()
-
-
-def _counted(count: int, thing: str) -> str:
-    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 Progress = Callable[[int, int], None]
@@ -285,7 +281,7 @@ def _page(
         page=Page(), policy=Markup(html.escape(POLICY)), version=__version__, title=title.strip(),
         caption=words.caption.strip(), about=counts_words(content, scene, state),
         objects=object_rows(content, scene, state),
-        photos=[(v.index, _data_url(content.thumbnails[v.index])) for v in _cameras(content, size)
+        photos=[(v.index, data_url(content.thumbnails[v.index])) for v in _cameras(content, size)
                 if v.index in content.thumbnails],
         left_out=state.excluded_views(), footer=_footer(content, size, words),
         label=label_words(sets) if any(len(g) for g in sets) else "",
@@ -357,10 +353,6 @@ def _short(values: Array) -> list[float]:
 def _json(data: dict[str, Any]) -> str:
     """Return JSON that no HTML parser takes for the end of its script."""
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-
-
-def _data_url(jpeg: bytes) -> Markup:
-    return Markup("data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii"))
 
 
 def _footer(content: SceneContent, size: StaticSize, words: PageWords) -> list[str]:
