@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console as RichConsole
 
 Tick = Callable[[int, int], None]
@@ -198,12 +200,17 @@ class Console:
         for text in texts:
             self._err.print(f"[yellow]note:[/yellow] {escape(text)}", soft_wrap=True)
 
-    def result(self, document: object) -> None:
+    def result(self, document: object, file: "Path | None" = None) -> None:
         """Print the command's whole result as JSON, if it was asked for; once in a command.
 
         Args:
             document: a mapping or a record (see `json_values`).
+            file: that takes it, too: plain JSON values then.
         """
+        if file is not None:
+            from realsim.store.atomic import write_json
+
+            write_json(file, document)
         if self._told is not None:
             self._told.document = document
         if self.as_json:

@@ -19,8 +19,6 @@ from typing import Any
 from realsim.errors import InputError
 from realsim.store import atomic
 
-CHUNK_BYTES = 1 << 20
-
 
 class Sent:
     """A file, a folder, or bytes that become a file: only read where the job runs."""
@@ -222,11 +220,8 @@ def digest_of(path: Path) -> str:
 @lru_cache(maxsize=100_000)
 def _digest(path: Path, size: int, changed_ns: int) -> str:
     """Return the SHA-256 of a file of this size and time."""
-    found = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            found.update(chunk)
-    return found.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # --- what comes back ------------------------------------------------------------------------------

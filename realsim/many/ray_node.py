@@ -8,6 +8,7 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Callable, Generator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -148,10 +149,8 @@ class _Kept:
         if not path.exists():
             folder.mkdir(parents=True, exist_ok=True)
             source = self.file(digest)
-            try:
+            with suppress(FileExistsError):  # another worker of this machine was quicker
                 os.link(source, path)
-            except FileExistsError:  # another worker of this machine was quicker
-                pass
         return path
 
     def _copied(self, item: WireFolder, folder: Path) -> Path:
@@ -169,12 +168,8 @@ State = Mapping[str, tuple[int, int, int]]
 
 def _state(folder: Path) -> State:
     """Return what tells a changed file."""
-    found: dict[str, tuple[int, int, int]] = {}
-    for path in files_in(folder):
-        status = path.stat()
-        name = path.relative_to(folder).as_posix()
-        found[name] = status.st_size, status.st_mtime_ns, status.st_ino
-    return found
+    found = ((path.relative_to(folder).as_posix(), path.stat()) for path in files_in(folder))
+    return {name: (s.st_size, s.st_mtime_ns, s.st_ino) for name, s in found}
 
 
 def _changed(folder: Path, before: State, after: State) -> Generator[bytes]:
@@ -182,11 +177,9 @@ def _changed(folder: Path, before: State, after: State) -> Generator[bytes]:
     changed = [name for name in after if after[name] != before.get(name)]
     for name in sorted(changed, key=lambda n: after[n][1]):
         with (folder / name).open("rb") as file:
-            data = file.read(PIECE_BYTES)
-            is_first = True
-            while True:
+            data, is_first, is_last = file.read(PIECE_BYTES), True, False
+            while not is_last:
                 following = file.read(PIECE_BYTES)
-                yield pickle.dumps(Piece(name, data, is_first, not following))
-                if not following:
-                    break
+                is_last = not following
+                yield pickle.dumps(Piece(name, data, is_first, is_last))
                 data, is_first = following, False

@@ -179,7 +179,7 @@ def _fresh() -> Generator[None]:
     Libraries read the environment when they load: it has to stand before the process starts.
     """
     with _starting:
-        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
         script = sys.modules["__main__"]
         os.environ.update(ONE_THREAD)
         sys.modules["__main__"] = ModuleType("__main__")
@@ -187,11 +187,9 @@ def _fresh() -> Generator[None]:
             yield
         finally:
             sys.modules["__main__"] = script
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
+            for name in ONE_THREAD:
+                del os.environ[name]
+            os.environ.update(before)
 
 
 def _end_with_parent() -> None:

@@ -1,23 +1,13 @@
 """What a check of a session found, as records."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from realsim.store.manifest import Entry
 
-Kind = Literal[
-    "missing",
-    "changed",
-    "unreadable",
-    "line",
-    "torn",
-    "leftover",
-    "unlisted",
-    "time",
-    "repeated",
-    "unproven",
-]
-DAMAGE: tuple[Kind, ...] = ("missing", "changed", "unreadable", "line")
+Damage = Literal["missing", "changed", "unreadable", "line"]
+Kind = Damage | Literal["torn", "leftover", "unlisted", "time", "repeated", "unproven"]
+DAMAGE: tuple[Kind, ...] = get_args(Damage)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -112,3 +102,7 @@ class Lists:
     )
     """The sound robot lines of every view."""
     findings: list[SessionFinding] = field(default_factory=list[SessionFinding])
+
+    def note(self, path: str, kind: Kind, found: str, view: int | None = None) -> None:
+        """Add a finding."""
+        self.findings.append(SessionFinding(path=path, kind=kind, found=found, view=view))

@@ -40,9 +40,9 @@ class GraspsHead:
 # --- one record, one file ---------------------------------------------------------------------
 
 
-def save_hand_eye(store: SessionStore, result: HandEye, name: str = HAND_EYE_FILE) -> None:
+def save_hand_eye(store: SessionStore, result: HandEye) -> None:
     """Write the calibration into the session."""
-    store.write_json(name, hand_eye_to_json(result))
+    store.write_json(HAND_EYE_FILE, hand_eye_to_json(result))
 
 
 def hand_eye_to_json(result: HandEye) -> dict[str, Any]:
@@ -63,19 +63,19 @@ def load_hand_eye(store: SessionStore, name: str = HAND_EYE_FILE) -> HandEye:
     return found
 
 
-def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> None:
+def save_board(store: SessionStore, board: TagBoard) -> None:
     """Write the calibration board into the session."""
-    store.write_json(name, to_json(board))
+    store.write_json(BOARD_FILE, to_json(board))
 
 
-def load_board(store: SessionStore, name: str = BOARD_FILE) -> TagBoard:
+def load_board(store: SessionStore) -> TagBoard:
     """Return the calibration board of the session."""
-    return read_own(store.path(name), TagBoard)
+    return read_own(store.path(BOARD_FILE), TagBoard)
 
 
-def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> None:
+def save_scene(store: SessionStore, scene: Scene) -> None:
     """Write the registered scene into the session."""
-    store.write_json(name, to_json(scene))
+    store.write_json(SCENE_FILE, to_json(scene))
 
 
 def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
@@ -110,15 +110,14 @@ def grasp_counts(grasps: GraspSet) -> dict[str, Any]:
         stage: int(np.count_nonzero(grasps.base_scores[tried] >= (k + 1) / len(STAGES)))
         for k, stage in enumerate(STAGES)
     }
+    failures = Counter(f.partition(":")[0] for f in grasps.failures if f)
     return {
         "candidates": len(grasps),
         "reachable": int(np.count_nonzero(grasps.reachable)),
         "tried": int(np.count_nonzero(tried)),
         "passed": passed,
         "good": int(np.count_nonzero(grasps.good)),
-        "failures": dict(
-            sorted(Counter(f.partition(":")[0] for f in grasps.failures if f).items())
-        ),
+        "failures": dict(sorted(failures.items())),
     }
 
 

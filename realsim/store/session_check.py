@@ -18,7 +18,7 @@ from realsim import images
 from realsim.errors import RealsimError
 from realsim.records import CameraIntrinsics, View
 from realsim.store import atomic
-from realsim.store.check_report import CheckReport, Kind, Lists, SessionFinding
+from realsim.store.check_report import CheckReport, Lists, SessionFinding
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import entry_from, entry_of, fault_of, take
@@ -66,14 +66,14 @@ def without_checksum(paths: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple
 def note_unproven(lists: Lists, unproven: Iterable[str]) -> None:
     """Note files that are without a checksum though the session lists its files."""
     noted = {f.path for f in lists.findings}
-    if MANIFEST_FILE in {f.path for f in lists.findings if f.kind == "missing"}:
+    if any(f.path == MANIFEST_FILE and f.kind == "missing" for f in lists.findings):
         return  # all of them: the lost list says it
     for path in unproven:
         if path not in noted:
             found = "no checksum: its line in the manifest is lost, or a run ended before it"
             if is_image(path):
                 found += "; the image can be read"
-            lists.findings.append(SessionFinding(path=path, kind="unproven", found=found))
+            lists.note(path, "unproven", found)
 
 
 def note_times(folder: Path, lists: Lists) -> None:
@@ -89,7 +89,7 @@ def note_times(folder: Path, lists: Lists) -> None:
         if before is not None and moment < before[1] and _in_one_run(runs, index, before[0]):
             found = f"view {index} at {moment:.3f} s was stored after view {before[0]} at "
             found += f"{before[1]:.3f} s; a camera that was restarted counts anew"
-            lists.findings.append(SessionFinding(path=ROBOT_FILE, kind="time", found=found))
+            lists.note(ROBOT_FILE, "time", found)
             return  # one restart shifts all that follow: the first is what matters
         before = (index, moment)
 
@@ -135,7 +135,7 @@ def note_repeated(folder: Path, lists: Lists) -> None:
             numbers = ", ".join(str(number) for number, _ in lines)
             found = f"view {index} has {len(lines)} lines ({numbers}); the last one counts"
             found += f"; {same} of them repeat another" if same else ""
-            lists.findings.append(SessionFinding(path=ROBOT_FILE, kind="repeated", found=found))
+            lists.note(ROBOT_FILE, "repeated", found)
 
 
 def note_orphans(folder: Path, lists: Lists, lost: set[int]) -> None:
@@ -147,17 +147,8 @@ def note_orphans(folder: Path, lists: Lists, lost: set[int]) -> None:
                 continue
             if int(file.stem) not in lost:
                 found = "no line in robot.jsonl: the run ended before the view was complete"
-                lists.findings.append(SessionFinding(path=path, kind="unlisted", found=found))
+                lists.note(path, "unlisted", found)
 
-
-__all__ = [
-    "CheckReport",
-    "SessionFinding",
-    "check_session",
-    "inner_sessions",
-    "is_session",
-    "read_lists",
-]
 
 DAMAGED = "damaged"
 """Folder of a session that takes what a repair takes out."""
@@ -186,7 +177,7 @@ def check_session(folder: Path | str, *, decode: bool = False) -> CheckReport:
     folder = Path(folder)
     lists = read_lists(folder)
     findings = lists.findings
-    camera = _camera_of(folder, findings)
+    camera = _camera_of(folder, lists)
     interrupted = _note_leftovers(folder, lists)
     interrupted |= _check_robot_file(folder, lists) or any(f.kind == "torn" for f in findings)
     ok = 0
@@ -197,7 +188,7 @@ def check_session(folder: Path | str, *, decode: bool = False) -> CheckReport:
         if fault is None:
             ok += 1
         elif path != CAMERA_FILE or not interrupted:
-            findings.append(SessionFinding(path=path, kind=fault.kind, found=fault.found))
+            lists.note(path, fault.kind, fault.found)
     robot_damaged = any(f.path == ROBOT_FILE and f.is_damage for f in findings)
     ok += int(ROBOT_FILE in lists.entries and not robot_damaged)
     sound = set(_sound_views(folder, lists, camera, decode))
@@ -237,10 +228,10 @@ def read_lists(folder: Path) -> Lists:
         path = folder / name
         if not path.is_file():
             if name == MANIFEST_FILE:
-                lists.findings.append(SessionFinding(path=name, kind="missing", found="no file"))
+                lists.note(name, "missing", "no file")
             continue
         if name == MANIFEST_FILE and not atomic.complete_lines(path):
-            lists.findings.append(SessionFinding(path=name, kind="missing", found="no line in it"))
+            lists.note(name, "missing", "no line in it")
         for number, line in enumerate(atomic.complete_lines(path), start=1):
             try:
                 if name == MANIFEST_FILE:
@@ -254,12 +245,8 @@ def read_lists(folder: Path) -> Lists:
                     lists.lines.setdefault(index, []).append((number, line))
             except (ValueError, RealsimError) as error:
                 named = INDEX.search(line) if name == ROBOT_FILE else None
-                lists.findings.append(
-                    SessionFinding(
-                        path=name, kind="line", found=f"line {number} {error}",
-                        view=None if named is None else int(named[1]),
-                    )
-                )  # fmt: skip
+                view = None if named is None else int(named[1])
+                lists.note(name, "line", f"line {number} {error}", view)
         data = path.read_bytes()
         if data and not data.endswith(b"\n"):
             half = len(data) - data.rfind(b"\n") - 1
@@ -267,24 +254,21 @@ def read_lists(folder: Path) -> Lists:
             tail = LISTED.search(data[-half:].decode(errors="replace"))
             if name == MANIFEST_FILE and tail is not None:
                 found += f": the checksum of {tail[1]} is lost"
-            lists.findings.append(SessionFinding(path=name, kind="torn", found=found))
+            lists.note(name, "torn", found)
     return lists
 
 
-def _camera_of(folder: Path, findings: list[SessionFinding]) -> CameraIntrinsics | None:
+def _camera_of(folder: Path, lists: Lists) -> CameraIntrinsics | None:
     """Return the camera of the header; a header that cannot be used is a finding."""
     try:
         return from_json(
             checked_header(folder / SESSION_FILE)["camera"], CameraIntrinsics, "the camera"
         )
     except RealsimError as error:
-        there = (folder / SESSION_FILE).is_file()
-        found = str(error) if there else "no file"
-        findings.append(
-            SessionFinding(
-                path=SESSION_FILE, kind="unreadable" if there else "missing", found=found
-            )
-        )
+        if (folder / SESSION_FILE).is_file():
+            lists.note(SESSION_FILE, "unreadable", str(error))
+        else:
+            lists.note(SESSION_FILE, "missing", "no file")
         return None
 
 
@@ -302,7 +286,7 @@ def _note_leftovers(folder: Path, lists: Lists) -> bool:
         if whole:
             found += "; opening the session gives it its name"
         name = path if whole else temporary.relative_to(folder).as_posix()
-        lists.findings.append(SessionFinding(path=name, kind="leftover", found=found))
+        lists.note(name, "leftover", found)
     return finished
 
 
@@ -314,11 +298,10 @@ def _check_robot_file(folder: Path, lists: Lists) -> bool:
     if entry is None:
         return bool(data)
     if entry_of(ROBOT_FILE, data[: entry.bytes]) != entry:
-        kind: Kind = "changed" if path.is_file() else "missing"
         found = f"{len(data)} bytes, {entry.bytes} were listed"
         if len(data) >= entry.bytes:
             found = f"other bytes than were written among the first {entry.bytes}"
-        lists.findings.append(SessionFinding(path=ROBOT_FILE, kind=kind, found=found))
+        lists.note(ROBOT_FILE, "changed" if path.is_file() else "missing", found)
         return False
     return len(data) > entry.bytes
 

@@ -90,9 +90,7 @@ def has_board_views_only(folder: Path) -> bool:
     return not is_session(folder) and (folder / BOARD_VIEWS / "session.json").is_file()
 
 
-def calibrate_board_only(
-    folder: Path, console: Console, arm: str = "", clock: str = "auto"
-) -> HandEye:
+def calibrate_board_only(folder: Path, console: Console, arm: str, clock: str) -> HandEye:
     """Calibrate the hand-eye from the board views; no camera of a session is placed yet.
 
     Nothing is noted as done: once there is a session, `realsim calibrate` does it anew, lists the

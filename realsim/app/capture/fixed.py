@@ -9,6 +9,8 @@ from realsim.store import SessionStore
 from realsim.store.cameras import camera_folder, camera_folders
 from realsim_capture_plans.devices.interfaces import DepthCamera
 
+FixedStores = list[tuple[DepthCamera, SessionStore]]
+
 
 def serials_of(text: str) -> dict[str, str]:
     """Return the serial numbers of "left=SERIAL,right=SERIAL" by name.
@@ -52,9 +54,7 @@ def open_fixed(text: str, simulated: bool, stack: ExitStack) -> dict[str, DepthC
     return found
 
 
-def fixed_stores(
-    store: SessionStore, cameras: dict[str, DepthCamera]
-) -> list[tuple[DepthCamera, SessionStore]]:
+def fixed_stores(store: SessionStore, cameras: dict[str, DepthCamera]) -> FixedStores:
     """Begin, or go on with, the session of every fixed camera inside the one of the hand.
 
     Raises:
@@ -68,7 +68,7 @@ def fixed_stores(
             f"--fixed-cameras names {', '.join(cameras) or 'none'}: its views would not be of all "
             "cameras. Give the same ones, or a new folder."
         )
-    found: list[tuple[DepthCamera, SessionStore]] = []
+    found: FixedStores = []
     for name, camera in cameras.items():
         folder = camera_folder(store.folder, name)
         if name in there:

@@ -12,7 +12,7 @@ import numpy as np
 
 from realsim.app.calibrate.board_views import BOARD_FILE
 from realsim.app.capture.devices import open_devices
-from realsim.app.capture.fixed import fixed_stores, open_fixed
+from realsim.app.capture.fixed import FixedStores, fixed_stores, open_fixed
 from realsim.app.console import Console, shortened
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.arrays import UInt8
@@ -42,6 +42,8 @@ BOARD_POINTS = 12
 """Points of the target that a view must show, three tags: fewer hardly turn the fit."""
 BOARD_SHRINK = 0.5
 """The target is first looked for in an image of half the size: three times as quick."""
+NAMED = 6
+"""Views whose reasons are printed."""
 TERMINATED = 143
 """Exit code of a process that was asked to end (128 + SIGTERM), as shells count."""
 
@@ -132,13 +134,7 @@ def _carry_out(
     request: CaptureRequest,
     plan: CapturePlan,
     devices: tuple[Arm, DepthCamera],
-    work: tuple[
-        CaptureConfig,
-        SessionStore,
-        Target | None,
-        "SimulatedLab | None",
-        "list[tuple[DepthCamera, SessionStore]]",
-    ],
+    work: tuple[CaptureConfig, SessionStore, Target | None, "SimulatedLab | None", FixedStores],
     console: Console,
 ) -> bool:
     """Capture, and show what was captured however it ended."""
@@ -154,9 +150,8 @@ def _carry_out(
                 on_view=taken.add, board_check=_board_check(target), fixed=fixed,
             )  # fmt: skip
             summary = capture(plan, arm, camera, store, config=config, job=job)
-        is_due = not store.has(
-            contact_sheet.SHEET_FILE
-        )  # an earlier run was killed before it wrote it
+        # An earlier run may have been killed before it wrote it.
+        is_due = not store.has(contact_sheet.SHEET_FILE)
         if lab is not None and target is None:
             _give_models(lab, store)
         show_summary(summary, console)
@@ -433,6 +428,7 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
         console.say("the same command offers the skipped views again.")
 
 
-def _reasons(found: tuple[tuple[int, str], ...], most: int = 6) -> str:
+def _reasons(found: tuple[tuple[int, str], ...]) -> str:
     """Return 'view: reason' of the first few."""
-    return "\n".join(shortened([f"{k}: {reason}" for k, reason in found], most, "and {} more"))
+    told = [f"{k}: {reason}" for k, reason in found]
+    return "\n".join(shortened(told, NAMED, "and {} more"))

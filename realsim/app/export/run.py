@@ -309,7 +309,10 @@ def _card(
         name=request.name or out.resolve().name,
         format=target.name,
         conventions=target.conventions,
-        scenes=[replace(f, written=_inside(f.written, out)) for f in facts],
+        scenes=[
+            replace(f, written=replace(f.written, folder=f.written.folder.relative_to(out)))
+            for f in facts
+        ],
         objects={i: m.name for i, m in models.items()} if target.kind in HOLD_OBJECTS else {},
         loading=_loading(target, out, inside),
         command=options_told(request, plain),
@@ -331,27 +334,16 @@ def _loading(target: Target, out: Path, scene: Path) -> str:
     return re.sub(r"\{file:([^}]+)\}", first, target.loading.replace("{scene}", scene.as_posix()))
 
 
-def _inside(written: WrittenScene, out: Path) -> WrittenScene:
-    return replace(written, folder=written.folder.relative_to(out))
-
-
 def show_export(result: ExportResult, console: Console) -> None:
     """Print what was written, and what was lost on the way."""
     if result.was_finished:
         console.say(f"this export is finished already: {result.folder}; nothing was written.")
         return
-    rows = [
-        [
-            s.name,
-            s.frames,
-            s.frames_written,
-            s.objects,
-            ", ".join(f"{v} {k}" for k, v in s.counts.items()),
-        ]
-        for s in result.scenes
-    ]
-    console.table(
-        f"exported into {result.folder}", ("scene", "frames", "written now", "poses", "more"), rows
-    )
+    rows: list[list[object]] = []
+    for s in result.scenes:
+        more = ", ".join(f"{v} {k}" for k, v in s.counts.items())
+        rows.append([s.name, s.frames, s.frames_written, s.objects, more])
+    header = ("scene", "frames", "written now", "poses", "more")
+    console.table(f"exported into {result.folder}", header, rows)
     console.warn(*dict.fromkeys(f"{s.name}: {n}" for s in result.scenes for n in s.notes))
     console.say(f"card      {result.card}")

@@ -88,14 +88,7 @@ def _request(**options: Any) -> "GenerateRequest":
     Raises:
         InputError: one cannot be used; it is named.
     """
-    from realsim.app.generate.request import (
-        GenerateRequest,
-        counts_of,
-        depth_model_of,
-        radius_of,
-        range_of,
-        size_of,
-    )
+    from realsim.app.generate import request
     from realsim_sim_bridge.synthetic.config import SyntheticConfig
     from realsim_sim_bridge.table_scenes.cameras import ViewConfig
     from realsim_sim_bridge.table_scenes.config import PoolConfig, TableSceneConfig
@@ -107,14 +100,14 @@ def _request(**options: Any) -> "GenerateRequest":
         renderer=options["renderer"],
         depth=options["depth"],
         profile=options["sensor"] or ("d405" if near else "d435"),
-        depth_model=depth_model_of(options["depth_model"], options["depth"]),
+        depth_model=request.depth_model_of(options["depth_model"], options["depth"]),
     )
-    return GenerateRequest(
+    return request.GenerateRequest(
         pool=open_pool(options["pools"]),
         seed=options["seed"],
         scene=TableSceneConfig(
-            objects=counts_of("--objects", str(options["objects"])),
-            sizes=range_of("--object-sizes", options["object_sizes"], "0.02-0.2"),
+            objects=request.counts_of("--objects", str(options["objects"])),
+            sizes=request.range_of("--object-sizes", options["object_sizes"], "0.02-0.2"),
             tables=options["tables"],
             pool=PoolConfig(
                 keep_size=options["keep_size"], unit=options["unit"], hull_only=options["hull_only"]
@@ -122,8 +115,8 @@ def _request(**options: Any) -> "GenerateRequest":
         ),
         views=ViewConfig(
             count=options["views"],
-            radius_m=radius_of(options["distance"], options["radius"]),
-            size=size_of(options["size"]),
+            radius_m=request.radius_of(options["distance"], options["radius"]),
+            size=request.size_of(options["size"]),
         ),
         rendering=replace(rendering, maps=()) if options["no_maps"] else rendering,
         looks=own_looks(options["hdris"], options["textures"]),

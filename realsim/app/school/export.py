@@ -13,7 +13,6 @@ from realsim.app.school.tables import SUMMARY_HEADER, agreement_line, p_hold_lin
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records import GraspSet
-from realsim.store import atomic
 from realsim.store.results import grasp_stem
 
 if TYPE_CHECKING:
@@ -145,6 +144,4 @@ def summarise(sources: Sequence[Path], json_file: Path | None, console: Console)
             "these scenes were tried at different settings; their scores are no one thing:"
         )
     console.say(*filter(None, (*settings, agreement_line(sets), p_hold_line(sets))))
-    if json_file is not None:
-        atomic.write_json(json_file, summary.to_json())
-    console.result(summary.to_json())
+    console.result(summary.to_json(), json_file)

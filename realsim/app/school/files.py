@@ -69,10 +69,7 @@ def write_outcome(outcome: SchoolOutcome) -> None:
     files[PAGE] = page_bytes(inputs.scene.name, sets, inputs.models, pictures)
     files[COUNTS] = atomic.json_bytes(as_json(sets, inputs.models))
     for name, data in files.items():
-        if inputs.store is not None:
-            inputs.store.write_bytes(name, data)
-        else:
-            atomic.write_bytes(inputs.folder / name, data)
+        inputs.write(name, data)
 
 
 def _remove_others(inputs: SchoolInputs, stems: set[str]) -> None:

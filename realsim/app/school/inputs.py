@@ -16,7 +16,7 @@ from realsim.many import Workers
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
 from realsim.robots.hand_file import STIFFEST_N_PER_M
-from realsim.store import SessionStore
+from realsim.store import SessionStore, atomic
 from realsim.store.opening import require_header
 
 CACHE = "grasps/cache"
@@ -113,6 +113,13 @@ class SchoolInputs:
     """Where results go: the session, or a folder of the user's."""
     store: SessionStore | None
     """The session; None = the scene came from elsewhere."""
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file of the results, in a session with its checksum."""
+        if self.store is not None:
+            self.store.write_bytes(name, data)
+        else:
+            atomic.write_bytes(self.folder / name, data)
 
 
 def is_session(source: Path) -> bool:

@@ -45,15 +45,12 @@ def settle(
     for a, b, depth_m in report.inside:
         console.say(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
     if inputs.store is not None and out is None:
-        inputs.store.write_bytes(f"reports/{PICTURE}", picture)
+        inputs.write(f"reports/{PICTURE}", picture)
         console.say(f"picture   {inputs.folder / 'reports' / PICTURE}")
     elif out is not None:
         atomic.write_bytes(out / PICTURE, picture)
         console.say(f"picture   {out / PICTURE}")
-    document = as_json(report)
-    if json_file is not None:
-        atomic.write_json(json_file, document)
-    console.result(document)
+    console.result(as_json(report), json_file)
     return report.stable
 
 
@@ -72,10 +69,7 @@ def warn_of_falls(inputs: SchoolInputs, console: Console) -> None:
             console.warn(f"'{o.name}' does not stand ({o.verdict}): {o.sentence}")
     for a, b, depth_m in report.inside:
         console.warn(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
-    if inputs.store is not None:
-        inputs.store.write_bytes(f"reports/{PICTURE}", picture)
-    else:
-        atomic.write_bytes(inputs.folder / "reports" / PICTURE, picture)
+    inputs.write(f"reports/{PICTURE}", picture)
 
 
 def _settled(

@@ -48,10 +48,7 @@ def validate_engines(
         show_report(report, console)
         if out is not None:
             _write(report, name, out, console)
-    document = {name: r.to_json() for name, r in reports.items()}
-    if json_file is not None:
-        atomic.write_json(json_file, document)
-    console.result(document)
+    console.result({name: r.to_json() for name, r in reports.items()}, json_file)
     return all(r.passed for r in reports.values())
 
 

@@ -152,9 +152,7 @@ def run_stats(
     console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
     console.warn(*notes)
     document = document_of(stats, left_out)
-    console.result(document)
-    if json_file is not None:
-        atomic.write_json(json_file, document)
+    console.result(document, json_file)
     if out is not None:
         _write_all(out, stats, document, notes, console)
     return stats
