@@ -10,7 +10,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.rendering.embedded import sky_light
-from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints
+from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints, weighted
 from realsim.rendering.embedded.texture_atlas import TextureArrays, color_at, footprint
 
 BUMPS_UNTIL = 0.25
@@ -254,11 +254,8 @@ def fill_tints(
         b, w = weights[i, 0], weights[i, 1]
         red, green, blue = s.base[g, 0], s.base[g, 1], s.base[g, 2]
         if s.first_color[g] >= 0:
-            col = s.colors[s.first_color[g] + face[i]]
-            a = 1.0 - b - w
-            red *= a * col[0, 0] + b * col[1, 0] + w * col[2, 0]
-            green *= a * col[0, 1] + b * col[1, 1] + w * col[2, 1]
-            blue *= a * col[0, 2] + b * col[1, 2] + w * col[2, 2]
+            r, gr, bl = weighted(s.colors, s.first_color[g] + face[i], (1.0 - b - w, b, w))
+            red, green, blue = red * r, green * gr, blue * bl
         else:
             p, c = s.uv[s.first_face[g] + face[i]], s.corners[s.first_face[g] + face[i]]
             ux, uy = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1]

@@ -15,11 +15,10 @@ from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.rendering.embedded.materials import Surface
-from realsim.rendering.embedded.surface_table import Edges, edges_of, plane_met
+from realsim.rendering.embedded.surface_table import face_seen, plane_met, smooth_normal
 from realsim.rendering.rays import PlacedMesh
 
 MOST_HALVINGS = 16
-Point = tuple[float, float, float]
 LIFT_M = 1e-4
 """Points are tested for shadow this far off the surface, or rounding would shade it by itself."""
 FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
@@ -217,31 +216,6 @@ def _painted(
 
 
 @njit(inline="always", error_model="numpy")
-def _face_seen(corners: Array32, f: int, eye: Point) -> tuple[Edges, Point, Point, Point]:
-    """Return of face f as seen from a point: its edges, o and q of `plane_met`, its unit normal."""
-    e = edges_of(corners, f)
-    o = (eye[0] - corners[f, 0, 0], eye[1] - corners[f, 0, 1], eye[2] - corners[f, 0, 2])
-    q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
-    x, y, z = e[1] * e[5] - e[2] * e[4], e[2] * e[3] - e[0] * e[5], e[0] * e[4] - e[1] * e[3]
-    size = max(np.sqrt(x * x + y * y + z * z), 1e-30)
-    return e, o, q, (x / size, y / size, z / size)
-
-
-@njit(inline="always", error_model="numpy")
-def _smooth(
-    normals: Array32, f: int, weights: tuple[float, float, float], flat: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """Return the unit shading normal at a point of face f, on the side of its normal."""
-    a, b, w = weights
-    x = a * normals[f, 0, 0] + b * normals[f, 1, 0] + w * normals[f, 2, 0]
-    y = a * normals[f, 0, 1] + b * normals[f, 1, 1] + w * normals[f, 2, 1]
-    z = a * normals[f, 0, 2] + b * normals[f, 1, 2] + w * normals[f, 2, 2]
-    size = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-    size = size if x * flat[0] + y * flat[1] + z * flat[2] >= 0.0 else -size
-    return x / size, y / size, z / size
-
-
-@njit(inline="always", error_model="numpy")
 def _fill_background(light: Array, up: float, out: Array32, n: int) -> None:
     """Fill row n with the room behind everything, by the elevation of the ray."""
     rise, fall = np.sqrt(max(up, 0.0)), np.sqrt(max(-up, 0.0))
@@ -278,7 +252,7 @@ def sample_room(
     layout, halvings, wraps, tint, glossy = s.layout, s.halvings, s.wraps, s.tint, s.glossy
     ambient, sunny, toward_sun = out.ambient, out.sunny, out.toward_sun
     f, eye = -1, (eyes[0, 0], eyes[0, 1], eyes[0, 2])
-    e, o, q, normal = _face_seen(corners, 0, eye)
+    e, o, q, normal = face_seen(corners, 0, eye)
     for n in range(len(rows)):
         i = rows[n]
         toward_sun[n, 0] = np.nan
@@ -299,13 +273,13 @@ def sample_room(
         )
         if f != first_face[g] + face[i]:  # neighbours are often on one face
             f, eye = int(first_face[g] + face[i]), (eyes[g, 0], eyes[g, 1], eyes[g, 2])
-            e, o, q, normal = _face_seen(corners, f, eye)
+            e, o, q, normal = face_seen(corners, f, eye)
         b, w, t = plane_met(e, o, q, (x, y, z))
         b, w = min(max(b, 0.0), 1.0), min(max(w, 0.0), 1.0)
         a, (fx, fy, fz) = max(1.0 - b - w, 0.0), normal
         if fx * x + fy * y + fz * z > 0.0:  # an open surface is lit from the side it is seen from
             fx, fy, fz = -fx, -fy, -fz
-        nx, ny, nz = _smooth(normals, f, (a, b, w), (fx, fy, fz))
+        nx, ny, nz = smooth_normal(normals, f, (a, b, w), (fx, fy, fz))
         sx, sy, sz = suns[g, 0], suns[g, 1], suns[g, 2]
         images = (texels, layout, int(halvings[g]), bool(wraps[g]))
         paint = _painted(painted, images, (g, f, a, b, w), t * pixel_rad * float(density[f]))

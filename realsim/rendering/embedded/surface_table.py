@@ -18,6 +18,7 @@ from realsim.rendering.embedded.texture_atlas import (
     MOST_PROBES,
     TextureArrays,
     TextureAtlas,
+    bent_normal,
     color_at,
     detail_at,
     footprint,
@@ -26,6 +27,7 @@ from realsim.rendering.rays import PlacedMesh
 
 Edges = tuple[float, float, float, float, float, float]
 """The two edges of a face from its first corner [m]."""
+Point = tuple[float, float, float]
 
 
 @njit(inline="always", error_model="numpy")
@@ -39,12 +41,38 @@ def edges_of(corners: Array32, f: int) -> Edges:
 
 
 @njit(inline="always", error_model="numpy")
-def plane_met(
-    e: Edges,
-    o: tuple[float, float, float],
-    q: tuple[float, float, float],
-    d: tuple[float, float, float],
-) -> tuple[float, float, float]:
+def face_seen(corners: Array32, f: int, eye: Point) -> tuple[Edges, Point, Point, Point]:
+    """Return of face f as seen from a point: its edges, o and q of `plane_met`, its unit normal."""
+    e = edges_of(corners, f)
+    o = (eye[0] - corners[f, 0, 0], eye[1] - corners[f, 0, 1], eye[2] - corners[f, 0, 2])
+    q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
+    x, y, z = e[1] * e[5] - e[2] * e[4], e[2] * e[3] - e[0] * e[5], e[0] * e[4] - e[1] * e[3]
+    size = max(np.sqrt(x * x + y * y + z * z), 1e-30)
+    return e, o, q, (x / size, y / size, z / size)
+
+
+@njit(inline="always", error_model="numpy")
+def weighted(values: Array32, f: int, weights: Point) -> Point:
+    """Return what a point of face f has by its corners' values (F, 3, 3)."""
+    a, b, w = weights
+    return (
+        a * values[f, 0, 0] + b * values[f, 1, 0] + w * values[f, 2, 0],
+        a * values[f, 0, 1] + b * values[f, 1, 1] + w * values[f, 2, 1],
+        a * values[f, 0, 2] + b * values[f, 1, 2] + w * values[f, 2, 2],
+    )
+
+
+@njit(inline="always", error_model="numpy")
+def smooth_normal(normals: Array32, f: int, weights: Point, flat: Point) -> Point:
+    """Return the unit shading normal at a point of face f, on the side of its normal."""
+    x, y, z = weighted(normals, f, weights)
+    size = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    size = size if x * flat[0] + y * flat[1] + z * flat[2] >= 0.0 else -size
+    return x / size, y / size, z / size
+
+
+@njit(inline="always", error_model="numpy")
+def plane_met(e: Edges, o: Point, q: Point, d: Point) -> Point:
     """Return the weights of the second and third corner, and t, where a ray meets a plane.
 
     Moller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
@@ -84,48 +112,6 @@ def bulge_of(e: Edges, m: Array32, weights: tuple[float, float, float]) -> float
     height += b * max(-(qx * m[1, 0] + qy * m[1, 1] + qz * m[1, 2]), 0.0)
     qx, qy, qz = px - e[3], py - e[4], pz - e[5]
     return height + w * max(-(qx * m[2, 0] + qy * m[2, 1] + qz * m[2, 2]), 0.0)
-
-
-@njit(error_model="numpy")
-def bent_normal(
-    n: tuple[float, float, float],
-    e: Edges,
-    uv: tuple[float, float, float, float],
-    bend: tuple[float, float, float, float],
-) -> tuple[float, float, float, float]:
-    """Return the normal bent by the normal image, and the spread of normals it stands for.
-
-    The averaged normal of many texels is shorter than 1; the rest widens the highlight (Toksvig,
-    "Mipmapping normal maps", 2005).
-    """
-    ux, uy, vx, vy = uv
-    det = ux * vy - uy * vx
-    if abs(det) < 1e-20:
-        return n[0], n[1], n[2], 0.0
-    tx, ty, tz = (
-        (e[0] * vy - e[3] * uy) / det,
-        (e[1] * vy - e[4] * uy) / det,
-        (e[2] * vy - e[5] * uy) / det,
-    )
-    along = tx * n[0] + ty * n[1] + tz * n[2]
-    tx, ty, tz = tx - along * n[0], ty - along * n[1], tz - along * n[2]
-    length = max(np.sqrt(tx * tx + ty * ty + tz * tz), 1e-20)
-    tx, ty, tz = tx / length, ty / length, tz / length
-    # The second axis runs along +v; mirrored coordinates turn it round.
-    bx, by, bz = n[1] * tz - n[2] * ty, n[2] * tx - n[0] * tz, n[0] * ty - n[1] * tx
-    wx, wy, wz = e[3] * ux - e[0] * vx, e[4] * ux - e[1] * vx, e[5] * ux - e[2] * vx
-    if (bx * wx + by * wy + bz * wz) * det < 0:
-        bx, by, bz = -bx, -by, -bz
-    # 8-bit images say 128 for "not bent", half a step off the middle.
-    x, y, z = (255 * bend[0] - 128) / 127, (255 * bend[1] - 128) / 127, (255 * bend[2] - 128) / 127
-    size = min(max(np.sqrt(x * x + y * y + z * z), 0.2), 1.0)
-    sx, sy, sz = (
-        tx * x + bx * y + n[0] * z,
-        ty * x + by * y + n[1] * z,
-        tz * x + bz * y + n[2] * z,
-    )
-    length = max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-12)
-    return sx / length, sy / length, sz / length, 2 * (1 - size) / size
 
 
 SAME_DIRECTION = 0.98
@@ -304,19 +290,13 @@ def _fill_geometry(
     pixel's width (2) and height (2); how much the normal turns within the pixel, squared.
     """
     eye, center, directions, along_u, along_v = rays
+    seen_from = (eye[0] - center[0], eye[1] - center[1], eye[2] - center[2])
     geometry, face = hits
     for i in range(len(geometry)):
         if geometry[i] < 0:
             continue
         f = s.first_face[geometry[i]] + face[i]
-        c = s.corners[f]
-        e = edges_of(s.corners, f)
-        o = (
-            eye[0] - center[0] - c[0, 0],
-            eye[1] - center[1] - c[0, 1],
-            eye[2] - center[2] - c[0, 2],
-        )
-        q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
+        e, o, q, (nx, ny, nz) = face_seen(s.corners, f, seen_from)
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
         b, w, t = plane_met(e, o, q, (x, y, z))
         # The footprint: where the rays of the next pixels meet the plane of the face.
@@ -329,19 +309,13 @@ def _fill_geometry(
         places[i, 0], places[i, 1] = b, w
         places[i, 2], places[i, 3], places[i, 4], places[i, 5] = bu, wu, bv, wv
 
-        nx, ny, nz = e[1] * e[5] - e[2] * e[4], e[2] * e[3] - e[0] * e[5], e[0] * e[4] - e[1] * e[3]
-        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-30)
-        length *= 1.0 if nx * x + ny * y + nz * z <= 0 else -1.0
-        nx, ny, nz = nx / length, ny / length, nz / length
+        if nx * x + ny * y + nz * z > 0:
+            nx, ny, nz = -nx, -ny, -nz
         out.flat[i, 0], out.flat[i, 1], out.flat[i, 2] = nx, ny, nz
         m = s.normals[f]
         a = max(1.0 - b - w, 0.0)
-        sx = a * m[0, 0] + b * m[1, 0] + w * m[2, 0]
-        sy = a * m[0, 1] + b * m[1, 1] + w * m[2, 1]
-        sz = a * m[0, 2] + b * m[1, 2] + w * m[2, 2]
-        length = max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-12)
-        length *= 1.0 if sx * nx + sy * ny + sz * nz >= 0 else -1.0
-        out.smooth[i, 0], out.smooth[i, 1], out.smooth[i, 2] = sx / length, sy / length, sz / length
+        sx, sy, sz = smooth_normal(s.normals, f, (a, b, w), (nx, ny, nz))
+        out.smooth[i, 0], out.smooth[i, 1], out.smooth[i, 2] = sx, sy, sz
         turn = 0.0
         for k in range(3):
             out.position[i, k] = eye[k] + t * directions[i, k]
@@ -412,11 +386,9 @@ def _fill_materials(
         red, green, blue = s.base[g, 0], s.base[g, 1], s.base[g, 2]
         rough = s.roughness[g]
         if s.first_color[g] >= 0:
-            col = s.colors[s.first_color[g] + face[i]]
-            a = max(1.0 - b - w, 0.0)
-            red *= a * col[0, 0] + b * col[1, 0] + w * col[2, 0]
-            green *= a * col[0, 1] + b * col[1, 1] + w * col[2, 1]
-            blue *= a * col[0, 2] + b * col[1, 2] + w * col[2, 2]
+            weights = (max(1.0 - b - w, 0.0), b, w)
+            r, gr, bl = weighted(s.colors, s.first_color[g] + face[i], weights)
+            red, green, blue = red * r, green * gr, blue * bl
         if s.images[g, 0] >= 0 or s.images[g, 1] >= 0 or s.images[g, 2] >= 0:
             f = s.first_face[g] + face[i]
             p, q = s.uv[f, 0, 0], s.uv[f, 0, 1]
