@@ -25,7 +25,7 @@ from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, CaptureSummary, capture
 from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_contact_sheet
 from realsim_capture_plans.capturing.log import CaptureLog
-from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
+from realsim_capture_plans.capturing.operator import CaptureStatus, Command, Operator
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
@@ -144,7 +144,7 @@ def unplugged(frame: Frame, before: Frame) -> Frame:
 
 
 @dataclass
-class Person(NoOperator):
+class Person(Operator):
     """Gives prepared answers and types prepared keys before the views."""
 
     answers: list[Command] = field(default_factory=list)
@@ -326,7 +326,7 @@ def small_plan(center: np.ndarray) -> CapturePlan:
     return plan_through(np.stack(joints), HOME, center, "calibration")
 
 
-class PersonAtThePendant(NoOperator):
+class PersonAtThePendant(Operator):
     """Clears whatever stopped the arm, then says go."""
 
     def __init__(self, controller: LoopbackController) -> None:

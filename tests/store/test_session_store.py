@@ -1,4 +1,4 @@
-"""A session, its grasps and their trajectories come back as they were; a kill leaves no half view."""
+"""A session, its grasps and trajectories come back as they were; a kill leaves no half view."""
 
 import json
 import shutil

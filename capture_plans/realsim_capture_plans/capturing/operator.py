@@ -16,7 +16,7 @@ import tty
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, TextIO
+from typing import TYPE_CHECKING, Any, Literal, Self, TextIO
 
 from realsim_capture_plans.capturing.checks import Check
 
@@ -53,45 +53,25 @@ class CaptureStatus:
     """Whether nothing is stored."""
 
 
-class Operator(Protocol):
-    """A person at the capture, or nobody."""
+class Operator:
+    """Who is asked and told: as it stands nobody, who hears nothing and cannot be asked."""
 
     def show(self, status: CaptureStatus) -> None:
         """Show where the capture stands; called several times a view, must be quick."""
-        ...
 
     def tell(self, text: str, *, trouble: bool = False) -> None:
         """Report an event; trouble also beeps."""
-        ...
 
     def commands(self) -> list[Command]:
         """Return what the person asked for since the last call, oldest first."""
-        ...
-
-    def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
-        """Wait for one of the choices; None where nobody can answer."""
-        ...
-
-
-class NoOperator:
-    """Nobody: says nothing, cannot be asked."""
-
-    def show(self, status: CaptureStatus) -> None:
-        """Show nothing."""
-
-    def tell(self, text: str, *, trouble: bool = False) -> None:
-        """Tell nobody."""
-
-    def commands(self) -> list[Command]:
-        """Return nothing."""
         return []
 
     def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
-        """Return None: nobody is there."""
+        """Wait for one of the choices; None where nobody can answer."""
         return None
 
 
-class LineOperator(NoOperator):
+class LineOperator(Operator):
     """Lines of text for a log file or a pipe; cannot be asked."""
 
     def __init__(self, write: Callable[[str], None], every: int = 16) -> None:
@@ -209,7 +189,7 @@ class KeyReader:
                     self._keys.put(KEYS[key])
 
 
-class TerminalOperator:
+class TerminalOperator(Operator):
     """A person at a terminal; to be used in a `with` block."""
 
     def __init__(self, title: str, keys: TextIO = sys.stdin, screen: TextIO = sys.stderr) -> None:

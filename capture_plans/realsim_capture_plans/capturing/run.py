@@ -18,7 +18,7 @@ from realsim.records import View
 from realsim_capture_plans.capturing import look
 from realsim_capture_plans.capturing.checks import Check
 from realsim_capture_plans.capturing.log import CaptureLog, replace_view
-from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator, Operator
+from realsim_capture_plans.capturing.operator import CaptureStatus, Command, Operator
 from realsim_capture_plans.devices.interfaces import Arm, ArmStoppedError, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
 
@@ -110,7 +110,7 @@ class CaptureSummary:
 class CaptureJob:
     """What a capture is to do beside taking every view, and whom it may ask."""
 
-    operator: Operator = field(default_factory=NoOperator)
+    operator: Operator = field(default_factory=Operator)
     """Who is told and asked; by default nobody."""
     board_check: look.BoardCheck | None = None
     """Says what is wrong with an image of the calibration target."""

@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.arrays import Array
-from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
 from realsim_capture_plans.collision.model import interpolate
-from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M
+from realsim_capture_plans.plan_files.evidence import FITS_M
 from realsim_capture_plans.plan_files.joint_paths import JointPath
 from realsim_capture_plans.planning.metrics import Meaning, joint_names
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.task import checked_center
 from realsim_capture_plans.planning.tour_time import TourTime
 
 LEAST_AXIS_SPREAD = 0.02
@@ -141,23 +142,6 @@ def axes_meeting_point(Ts_base_cam: Array) -> Array:
             "--center x,y,z [m]."
         )
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, eye))
-
-
-def checked_center(center: ArrayLike) -> Array:
-    """Return a scene centre (3,) [m].
-
-    Raises:
-        UnitError: it cannot be in metres.
-    """
-    c = np.array(center, dtype=np.float64)
-    if c.shape != (3,) or not np.all(np.isfinite(c)):
-        raise InputError(f"the scene centre is {c.tolist()}; x,y,z in the robot's base [m].")
-    if np.any(np.abs(c) > MILLIMETRES_FROM_M):
-        raise UnitError(
-            f"the scene centre is {c.tolist()} m, farther than any arm reaches. These look "
-            f"like millimetres: {(c * 1e-3).tolist()} m?"
-        )
-    return c
 
 
 def _check_limits(path: JointPath, chain: DhChain) -> None:

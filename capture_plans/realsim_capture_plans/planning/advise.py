@@ -171,12 +171,7 @@ def _placement(
     )
     model = CollisionModel(chain, mount, here.work_cell(center, "hemisphere"), here.clearance_m)
     count = max(least_directions, n)
-    directions = np.concatenate(
-        [
-            viewpoints.golden_cap(count, here.elevation_deg),
-            viewpoints.cap_rim(count, here.elevation_deg),
-        ]
-    )
+    directions = viewpoints.cap_with_rim(count, here.elevation_deg)
     poses, item = viewpoints.hemisphere_poses(center, directions, here.radius_m, poses_each, 0.0)
     found = viewpoints.reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
     one_side = found.where(bend(chain, found.joints) * viewpoints.better_elbow(found, chain) > 0)

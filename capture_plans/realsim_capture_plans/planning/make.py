@@ -121,9 +121,7 @@ def reachable_directions(task: PlanTask, n: int) -> tuple[Array, viewpoints.Cand
     config = task.config
     spin = se3.exp_so3([0.0, 0.0, task.rng.uniform(0.0, 2 * np.pi)])
     tried = max(config.oversampling * n, config.least_directions)
-    cap = viewpoints.golden_cap(tried, config.elevation_deg)
-    # The spiral ends half a turn short of the rim, where the cells of its last views reach out.
-    directions = np.concatenate([cap, viewpoints.cap_rim(tried, config.elevation_deg)]) @ spin.T
+    directions = viewpoints.cap_with_rim(tried, config.elevation_deg) @ spin.T
     tried = len(directions)
     per_direction = _poses(task, config.poses_per_direction)
     poses, item = viewpoints.hemisphere_poses(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.arrays import Array
-from realsim.errors import InputError
+from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.robots.kinematics import DhChain
@@ -52,6 +52,24 @@ class PlanTask:
         )  # fmt: skip
 
 
+def checked_center(center: ArrayLike) -> Array:
+    """Return a scene centre (3,) [m].
+
+    Raises:
+        InputError: it is no point.
+        UnitError: it cannot be in metres.
+    """
+    c = np.array(center, dtype=np.float64)
+    if c.shape != (3,) or not np.all(np.isfinite(c)):
+        raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
+    if np.abs(c).max() > GREATEST_CENTER_M:
+        raise UnitError(
+            f"the scene centre is {c.tolist()} m, farther than any arm reaches. Were millimetres "
+            f"given? Metres are needed: {(c * 1e-3).tolist()} m?"
+        )
+    return c
+
+
 def plan_task(  # noqa: PLR0913, PLR0917 - hands on what both kinds of plan are given
     kind: Kind,
     n: int,
@@ -66,14 +84,7 @@ def plan_task(  # noqa: PLR0913, PLR0917 - hands on what both kinds of plan are 
     """Check what was given and build the collision model."""
     if n < 1:
         raise InputError(f"a plan of {n} views was asked for; at least 1 is needed.")
-    c = np.array(center, dtype=np.float64)
-    if c.shape != (3,) or not np.all(np.isfinite(c)):
-        raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
-    if np.abs(c).max() > GREATEST_CENTER_M:
-        raise InputError(
-            f"the scene centre {c.tolist()} m is {np.abs(c).max():.0f} m from the base, farther "
-            "than any arm reaches. Were millimetres given? Metres are needed."
-        )
+    c = checked_center(center)
     carried = mount if isinstance(mount, Mount) else d405_mount(mount)
     cell = config.work_cell(c, kind, obstacles)
     # One speed for all joints: that of the slowest at the most.

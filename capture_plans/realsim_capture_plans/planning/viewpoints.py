@@ -69,13 +69,17 @@ def golden_cap(n: int, elevation_deg: tuple[float, float]) -> Array:
     return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
 
 
-def cap_rim(n: int, elevation_deg: tuple[float, float]) -> Array:
-    """Return unit vectors (K, 3) on the lower rim, as far apart as n vectors over the whole cap."""
+def cap_with_rim(n: int, elevation_deg: tuple[float, float]) -> Array:
+    """Return n unit vectors over a cap (`golden_cap`) and, as far apart, some on its lower rim.
+
+    The spiral ends half a turn short of the rim, where the cells of its last vectors reach out.
+    """
     low, high = np.sin(np.radians(elevation_deg))
     spacing = np.sqrt(2 * np.pi * (high - low) / n)
     r = np.cos(np.radians(elevation_deg[0]))
     azimuth = np.arange(0.0, 2 * np.pi, spacing / r)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(len(azimuth), low)], -1)
+    rim = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(len(azimuth), low)], -1)
+    return np.concatenate([golden_cap(n, elevation_deg), rim])
 
 
 def look_at_poses(eyes: Array, targets: ArrayLike, rolls: Array) -> Array:

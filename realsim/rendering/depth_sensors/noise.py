@@ -33,23 +33,8 @@ def correlated(
     """
     import cv2
 
-    if aspect != 1.0 and sigma_px > 0:
-        return _stretched(rng, shape, sigma_px, aspect)
-    pad = int(np.ceil(3 * sigma_px)) if sigma_px > 0 else 0
-    noise = rng.standard_normal((shape[0] + 2 * pad, shape[1] + 2 * pad), dtype=np.float32)
-    if pad == 0:
-        return noise
-    kernel = _kernel(sigma_px, pad)
-    smooth = np.asarray(cv2.sepFilter2D(noise, -1, kernel, kernel), np.float32)
-    return np.ascontiguousarray(smooth[pad:-pad, pad:-pad])
-
-
-def _stretched(
-    rng: np.random.Generator, shape: tuple[int, int], sigma_px: float, aspect: float
-) -> Array32:
-    """Return `correlated` noise whose radius differs along rows and columns."""
-    import cv2
-
+    if sigma_px <= 0:
+        return rng.standard_normal(shape, dtype=np.float32)
     pad_u, pad_v = int(np.ceil(3 * sigma_px)), max(1, int(np.ceil(3 * sigma_px * aspect)))
     size = (shape[0] + 2 * pad_v, shape[1] + 2 * pad_u)
     noise = rng.standard_normal(size, dtype=np.float32)

@@ -136,8 +136,6 @@ class Step:
 
     quantum_px: float
     """The step [px]; 0 = none was found."""
-    coherence: float
-    """How well the disparities lie on its multiples: 1 = all, 0 = not at all."""
     least_px: float
     """Smaller steps than this are hidden by the depth unit of the files [px]."""
 
@@ -165,19 +163,19 @@ def disparity_step(
     least = 2 * fB * unit_m / nearest**2
     values, counts = np.unique(np.round(z / unit_m), return_counts=True)
     if len(values) < MIN_LEVELS:
-        return Step(quantum_px=0.0, coherence=0.0, least_px=least)
+        return Step(quantum_px=0.0, least_px=least)
     common = np.argsort(counts)[-MOST_LEVELS:]
     d = fB / (values[common] * unit_m)
     weight = counts[common] / counts[common].sum()
     blur = fB * unit_m / np.square(values[common] * unit_m)
     span = float(d.max() - d.min())
     if span <= 0:
-        return Step(quantum_px=0.0, coherence=0.0, least_px=least)
+        return Step(quantum_px=0.0, least_px=least)
     top = min(1 / least, MOST_STEPS_PER_PX)
     # A comb seen over fewer than three of its teeth cannot be told from chance.
     frequency = np.arange(3 / span, top, 0.1 / span)
     if len(frequency) == 0:
-        return Step(quantum_px=0.0, coherence=0.0, least_px=least)
+        return Step(quantum_px=0.0, least_px=least)
     found = np.empty(len(frequency))
     for a in range(0, len(frequency), 512):
         f = frequency[a : a + 512]
@@ -188,7 +186,7 @@ def disparity_step(
         k += 1
     coherence = float(min(found[k], 1.0))
     step = 1 / float(frequency[k]) if coherence > LEAST_COHERENCE else 0.0
-    return Step(quantum_px=step, coherence=coherence, least_px=least)
+    return Step(quantum_px=step, least_px=least)
 
 
 MIN_LEVELS, MOST_LEVELS = 12, 1200

@@ -5,6 +5,7 @@ does not raise: the process aborts. So each library is tried in a process of its
 one small picture, and the verdict is kept by the library's path, size and time.
 """
 
+import contextlib
 import glob
 import importlib.metadata
 import json
@@ -13,11 +14,11 @@ import re
 import subprocess
 import sys
 import sysconfig
-import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from realsim.store.atomic import write_text
 from realsim.user_cache import user_cache
 
 LEAST_LLVM = 19
@@ -166,11 +167,5 @@ def _read_verdicts() -> dict[str, str]:
 
 def _write_verdicts(verdicts: dict[str, str]) -> None:
     """Keep the verdicts; where nothing can be written the next process tries again."""
-    path = user_cache(VERDICTS)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
-            json.dump(verdicts, file)
-        os.replace(file.name, path)
-    except OSError:
-        return
+    with contextlib.suppress(OSError):
+        write_text(user_cache(VERDICTS), json.dumps(verdicts))

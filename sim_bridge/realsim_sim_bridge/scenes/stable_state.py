@@ -12,7 +12,6 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.errors import RealsimError
 from realsim.geometry import se3
-from realsim.records import Scene
 from realsim_sim_bridge.scenes.table_world import TABLE, TableWorld
 
 Standing = Literal["stands", "jumps", "falls", "inside another", "floats"]
@@ -91,12 +90,6 @@ class StandReport:
     def stable(self) -> bool:
         """Whether every object stands."""
         return all(o.verdict == "stands" for o in self.objects)
-
-    def settled(self, scene: Scene) -> Scene:
-        """Return the scene with every object where it came to rest."""
-        after = {o.instance: o.T_world_after for o in self.objects}
-        objects = tuple(replace(o, T_world_obj=after[o.instance]) for o in scene.objects)
-        return replace(scene, objects=objects)
 
 
 HEADERS = ("object", "verdict", "moved [mm]", "turned [deg]", "jump [m/s]", "sunk [mm]", "what")
