@@ -6,13 +6,8 @@ from realsim import CameraIntrinsics, Mesh
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.rendering.overlay import (
-    draw_axes,
-    draw_legend,
-    draw_outlines,
-    instance_color,
-    save_png,
-)
+from realsim.rendering.overlay import draw_axes, draw_outlines, instance_color, save_png
+from realsim.rendering.overlay_words import write_legend
 from realsim.rendering.photo import PhotoRenderer
 
 intrinsics = CameraIntrinsics(
@@ -46,6 +41,7 @@ for i, name in enumerate(names):
 picture = draw_outlines(photo.rgb, labels.ids)
 for p in placed[1:]:
     picture = draw_axes(picture, intrinsics, se3.invert(T_world_cam) @ p.T_world_obj, 0.03)
-picture = draw_legend(picture, [(name, instance_color(i)) for i, name in enumerate(names)])
+entries = [(name, instance_color(i)) for i, name in enumerate(names)]
+picture = write_legend(picture, entries, labels.ids >= 0)
 save_png("labels_of_a_frame.png", picture)
 print("picture: labels_of_a_frame.png")

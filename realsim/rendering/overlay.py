@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Image, Int32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
+from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, GraspSet
 
 Color = tuple[int, int, int]
@@ -289,28 +290,6 @@ def depth_picture(
     return np.where(valid[..., None], bgr[..., ::-1], 0).astype(np.uint8)
 
 
-def draw_legend(rgb: Image, entries: Sequence[tuple[str, Color]]) -> Image:
-    """Return the picture with a legend of (text, colour) in its upper left corner."""
-    import cv2
-
-    if not entries:
-        return rgb.copy()
-    out = rgb.copy()
-    size = float(np.clip(rgb.shape[0] / 1400, 0.36, 0.9))
-    widths = [cv2.getTextSize(t, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] for t, _ in entries]
-    row = round(38 * size)
-    pad = round(14 * size)
-    w, h = min(max(widths) + row + 2 * pad, out.shape[1]), min(
-        row * len(entries) + 2 * pad, out.shape[0])  # fmt: skip
-    out[:h, :w] = np.round(0.25 * out[:h, :w] + 0.75 * np.array(PAPER)).astype(np.uint8)
-    for k, (text, color) in enumerate(entries):
-        y = pad + k * row
-        cv2.rectangle(out, (pad, y + row // 5), (pad + row // 2, y + row * 4 // 5), color, -1)
-        at = (pad + row * 3 // 4, y + row * 3 // 4)
-        cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
-    return out
-
-
 def contact_sheet(
     images: Sequence[Image], columns: int, captions: Sequence[str] | None = None
 ) -> Image:
@@ -374,17 +353,12 @@ def save_png(path: Path | str, rgb: Image) -> None:
     """Write a picture (H, W, 3) as PNG, by way of a temporary name.
 
     Raises:
-        InputError: the folder does not exist or cannot be written.
+        InputError: the folder does not exist or cannot be written, or that is no picture.
     """
-    import cv2
-
-    path = Path(path)
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
-    if not ok:
-        raise InputError(f"the picture of shape {rgb.shape} cannot be encoded as PNG.")
+    path, data = Path(path), png_bytes(np.ascontiguousarray(rgb))
     partial = path.with_name(path.name + ".part")
     try:
-        partial.write_bytes(np.asarray(data).tobytes())
+        partial.write_bytes(data)
         partial.replace(path)
     except OSError as error:
         raise InputError(

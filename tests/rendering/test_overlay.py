@@ -115,7 +115,7 @@ def test_contact_sheet_holds_every_picture() -> None:
 
 
 def test_legend_and_png(tmp_path: Path) -> None:
-    out = overlay.draw_legend(black(), [("mug", (255, 0, 0))])
+    out = write_legend(black(), [("mug", (255, 0, 0))], np.zeros((240, 320), bool))
     overlay.save_png(tmp_path / "a.png", out)
     assert np.array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], out)
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
