@@ -26,18 +26,8 @@ from realsim_capture_plans.pictures.drawing import (
     save_png,
 )
 from realsim_capture_plans.pictures.motion_charts import clearance_chart, joints_chart
+from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.record import CapturePlan
-from realsim_capture_plans.planning.view_quality import (
-    board_views,
-    centre_depth,
-    hole_deg,
-    nearest_deg,
-    parallax_deg,
-    scene_box,
-    scene_points,
-    seen,
-    spacing_deg,
-)
 
 AZIMUTHS, TILTS = 361, 91
 """Cells of the map of holes: one degree each."""
@@ -72,7 +62,7 @@ def draw_coverage(figure: Any, axes: Any, curves: PlanCurves) -> None:
     tilt = np.linspace(0.0, 90.0, TILTS)
     grid = np.stack(np.meshgrid(azimuth, np.radians(tilt), indexing="xy"), -1)
     target = _unit(grid[..., 0], grid[..., 1])
-    hole = nearest_deg(directions, target.reshape(-1, 3)).reshape(target.shape[:2])
+    hole = view_quality.nearest_deg(directions, target.reshape(-1, 3)).reshape(target.shape[:2])
     mesh = axes.pcolormesh(
         azimuth, tilt, hole, cmap="Blues", shading="gouraud", rasterized=True, vmin=0.0,
         vmax=max(HOLE_COLOR_DEG, SPARE_COLOR * _hole(curves)),
@@ -140,7 +130,7 @@ def _hole(curves: PlanCurves) -> float:
     """Return the greatest hole [deg], measured here where the metrics do not have it."""
     if "hole_deg" in curves.metrics:
         return curves.metrics["hole_deg"]
-    return hole_deg(curves.plan.directions(), curves.plan.config.elevation_deg)
+    return view_quality.hole_deg(curves.plan.directions(), curves.plan.config.elevation_deg)
 
 
 def _unit(azimuth: Array, from_top: Array) -> Array:
@@ -174,8 +164,8 @@ def quality_chart(curves: PlanCurves) -> Any:
     figure = new_figure(11.5, 7.0)
     axes = figure.subplots(2, 3).ravel()
     radius = np.linalg.norm(plan.Ts_base_cam[:, :3, 3] - plan.center_world, axis=-1)
-    noise_mm = 1000 * sensor.depth_noise(centre_depth(plan))
-    in_view = seen(plan, scene_points(plan), sensor).mean(axis=1)
+    noise_mm = 1000 * sensor.depth_noise(view_quality.centre_depth(plan))
+    in_view = view_quality.seen(plan, view_quality.scene_points(plan), sensor).mean(axis=1)
     _histogram(axes[0], radius, BLUE, "camera to the scene's centre [m]")
     _histogram(axes[1], noise_mm, ORANGE, f"depth noise at the centre [mm], {sensor.name}")
     _histogram(axes[2], 100 * in_view, GREEN, "share of the scene in the image [%]",
@@ -184,9 +174,11 @@ def quality_chart(curves: PlanCurves) -> Any:
     _histogram(axes[3], sigma, PURPLE, "least singular value of the Jacobian",
                line=(plan.config.sigma_min, "required"))  # fmt: skip
     if len(plan) > 1:
-        spacing = spacing_deg(plan.directions())
+        spacing = view_quality.spacing_deg(plan.directions())
         _histogram(axes[4], spacing, SKY, "angle to the nearest other view [deg]")
-        _histogram(axes[5], parallax_deg(plan), RED, "angle between consecutive views [deg]")
+        _histogram(
+            axes[5], view_quality.parallax_deg(plan), RED, "angle between consecutive views [deg]"
+        )
     else:
         axes[4].set_axis_off()
         axes[5].set_axis_off()
@@ -222,7 +214,7 @@ def board_chart(curves: PlanCurves) -> Any:
     draw_rolls(figure, figure.add_subplot(grid[0], projection="polar"), curves)
     _draw_outlines(figure.add_subplot(grid[1]), curves)
     m = curves.metrics
-    gap = m.get("roll_gap_deg", board_views(curves.plan).roll_gap_deg)
+    gap = m.get("roll_gap_deg", view_quality.board_views(curves.plan).roll_gap_deg)
     figure.suptitle(
         f"{len(curves.plan)} calibration views: widest gap between rolls {gap:.0f}° "
         f"(should be below {720 / len(curves.plan):.0f}°)",
@@ -233,7 +225,7 @@ def board_chart(curves: PlanCurves) -> Any:
 
 def draw_rolls(figure: Any, axes: Any, curves: PlanCurves) -> None:
     """Draw every view by its roll (angle) and tilt (radius), coloured by its distance."""
-    board = board_views(curves.plan)
+    board = view_quality.board_views(curves.plan)
     dots = axes.scatter(
         np.radians(board.roll_deg), board.tilt_deg, c=1000 * board.distance_m, cmap="viridis",
         s=46, edgecolors="white", linewidths=0.5, zorder=3,
@@ -247,7 +239,7 @@ def draw_rolls(figure: Any, axes: Any, curves: PlanCurves) -> None:
 def _draw_outlines(axes: Any, curves: PlanCurves) -> None:
     """Draw where the board's area lies in every image."""
     plan, camera = curves.plan, curves.sensor.intrinsics
-    box = scene_box(plan)
+    box = view_quality.scene_box(plan)
     (x0, y0, _), (x1, y1, _), z = box.lower, box.upper, float(plan.center_world[2])
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z], [x0, y0, z]])
     to_cam = se3.invert(plan.Ts_base_cam)

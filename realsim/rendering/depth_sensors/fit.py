@@ -17,14 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors import autocovariance
+from realsim.rendering.depth_sensors import autocovariance, fit_resimulated
 from realsim.rendering.depth_sensors.edges import edges_of
-from realsim.rendering.depth_sensors.fit_resimulated import (
-    resampling_pitch,
-    scaled,
-    typical_noise,
-    whole_pixel_gain,
-)
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneView, find_plane
 from realsim.rendering.depth_sensors.plane_faults import (
@@ -204,7 +198,7 @@ def _of_planes(
     holes = count_holes(planes)
     found |= blobs_of(planes) | grazing_of(holes)
     found |= bands | {"warp_px": warp_of(planes)}
-    found["whole_pixel_gain"] = whole_pixel_gain(
+    found["whole_pixel_gain"] = fit_resimulated.whole_pixel_gain(
         planes, intrinsics, kind.baseline_m, found["quantum_px"].value, rounding
     )
     found["bias_px"] = _bias(planes, truths, fB)
@@ -232,9 +226,11 @@ def _as_simulated(
     """
     notes: list[str] = []
     model = _model(kind, unit, found)
-    ratio, wider = typical_noise(depths, planes, intrinsics, model)
-    found["correlation_px"] = scaled(found["correlation_px"], wider)
-    found |= {n: scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
+    ratio, wider = fit_resimulated.typical_noise(depths, planes, intrinsics, model)
+    found["correlation_px"] = fit_resimulated.scaled(found["correlation_px"], wider)
+    found |= {
+        n: fit_resimulated.scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")
+    }
     model = _model(kind, unit, found)
     if abs(np.log(ratio)) > np.log(HEAVY_TAILS):
         notes.append(
@@ -242,7 +238,7 @@ def _as_simulated(
             f"the places have {ratio:.2f} x what the standard deviation says, and the model has "
             "what they have."
         )
-    pitch = resampling_pitch(depths, planes, intrinsics, model, unit)
+    pitch = fit_resimulated.resampling_pitch(depths, planes, intrinsics, model, unit)
     found["native_pitch_px"] = pitch
     return replace(model, native_pitch_px=pitch.value if pitch.determined else 1.0), notes
 
