@@ -11,15 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.faults.consequences import (
-    SINGLE_VIEWS,
-    check_of,
-    drawings_check,
-    examine,
-    half_turned,
-    motion_check_of,
-    renumbered,
-)
+from realsim_calibration.faults import consequences
 from realsim_calibration.faults.gates import (
     TWIN_RATIO,
     frame_gate,
@@ -101,11 +93,11 @@ def screen(
     A, C = stacks(candidates)
     check_observable(A)
     labels = [c.view.label for c in candidates]
-    diagnosis = examine(
+    diagnosis = consequences.examine(
         _given(candidates), C, labels, target, config.mode, _nominal(candidates, arm),
     )  # fmt: skip
-    conventions = check_of(diagnosis, [c.view.index for c in candidates])
-    if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
+    conventions = consequences.check_of(diagnosis, [c.view.index for c in candidates])
+    if diagnosis is not None and diagnosis.fault in consequences.SINGLE_VIEWS:
         rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
         keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
         candidates, C = [candidates[k] for k in keep], C[keep]
@@ -119,7 +111,7 @@ def screen(
     mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C)
     candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
     used = stacks(candidates)[1]
-    motion = motion_check_of(_given(candidates), used, middle, eye_in_hand=in_hand)
+    motion = consequences.motion_check_of(_given(candidates), used, middle, eye_in_hand=in_hand)
     return Screened(
         candidates=candidates,
         rejected=rejected | more,
@@ -130,7 +122,7 @@ def screen(
         roll_range_deg=roll_range_deg(used),
         checks=(
             *(c for c in (conventions, turned, motion) if c is not None),
-            *drawings_check([(v.index, v.detection) for v in views]),
+            *consequences.drawings_check([(v.index, v.detection) for v in views]),
         ),
     )
 
@@ -161,7 +153,7 @@ def _counted_from_one_end(
 ) -> tuple[list[Candidate], Check | None]:
     """Return the candidates with boards that were counted from the wrong end counted anew."""
     A, C = stacks(candidates)
-    turns = half_turned(A, C, target)
+    turns = consequences.half_turned(A, C, target)
     if turns is None:
         return candidates, None
     mended: list[Candidate] = []
@@ -169,7 +161,7 @@ def _counted_from_one_end(
         if not flip:
             mended.append(c)
             continue
-        view = replace(c.view, detection=renumbered(c.view.detection, target))
+        view = replace(c.view, detection=consequences.renumbered(c.view.detection, target))
         points = view.detection.points(target)
         pose = estimate_board_pose(points, view.detection.uv, intrinsics)
         if pose is not None:

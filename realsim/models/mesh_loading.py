@@ -12,15 +12,7 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.geometry.mesh_files import MOST_TEXELS
 from realsim.interop import unbroken
-from realsim.models.mesh_atlas import (
-    FileContent,
-    Piece,
-    image_array,
-    placed,
-    rgb8,
-    tinted,
-    transformed_uv,
-)
+from realsim.models import mesh_atlas
 from realsim.untrusted.files import require_permission
 
 GLTF_FORMATS = (".glb", ".gltf")
@@ -33,7 +25,7 @@ HEADER_BYTES = 4096
 """Length of a text header that is read for what the file says of itself."""
 
 
-def load_pieces(path: Path) -> FileContent:
+def load_pieces(path: Path) -> mesh_atlas.FileContent:
     """Return the pieces of a file with their nodes' transforms applied, and what it says.
 
     Raises:
@@ -70,7 +62,7 @@ def load_pieces(path: Path) -> FileContent:
     if pictures and kind == ".ply" and all(p.image is None for p in pieces):
         notes.append(_without_coordinates(f"the texture '{pictures[0]}'"))
     is_gltf = kind in GLTF_FORMATS
-    return FileContent(
+    return mesh_atlas.FileContent(
         pieces=tuple(pieces),
         declared=declared,
         notes=tuple(notes),
@@ -132,12 +124,12 @@ def _folder(path: Path) -> Any:
 
 def _pieces(
     scene: Any, kind: str, folder: Any, header: dict[str, Any], notes: list[str]
-) -> list[Piece]:
+) -> list[mesh_atlas.Piece]:
     """Return the pieces of a trimesh scene, every node placed by its transform."""
-    pieces: list[Piece] = []
+    pieces: list[mesh_atlas.Piece] = []
     others = 0
     transforms = _texture_transforms(header, notes)
-    known: dict[str, Piece] = {}
+    known: dict[str, mesh_atlas.Piece] = {}
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -147,7 +139,7 @@ def _pieces(
             continue
         if name not in known:
             known[name] = _piece(str(name), geometry, faces, kind, folder, transforms, notes)
-        piece, is_mirrored = placed(known[name], matrix)
+        piece, is_mirrored = mesh_atlas.placed(known[name], matrix)
         if is_mirrored:
             notes.append(
                 f"node '{node}' is mirrored by its transform; its faces were turned so that the "
@@ -167,10 +159,10 @@ def _piece(
     folder: Any,
     transforms: dict[str, tuple[Any, float, Any]],
     notes: list[str],
-) -> Piece:
+) -> mesh_atlas.Piece:
     """Return one trimesh mesh with its colours, in its own coordinates."""
     vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)
-    piece = Piece(name=name, vertices=vertices, faces=faces)
+    piece = mesh_atlas.Piece(name=name, vertices=vertices, faces=faces)
     visual = geometry.visual
     if visual.kind in ("vertex", "face"):
         colors = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
@@ -187,19 +179,19 @@ def _piece(
         try:
             if image.width * image.height > MOST_TEXELS:
                 raise ValueError(f"it claims {image.width}x{image.height} pixels")
-            texture = image_array(image)
+            texture = mesh_atlas.image_array(image)
         except Exception as error:  # pillow decodes late: a broken or huge picture shows only here
             notes.append(f"the texture of '{name}' cannot be decoded ({error}); it is left out.")
         else:
             if material.name in transforms:
-                uv = transformed_uv(uv, *transforms[material.name], v_down=True)
+                uv = mesh_atlas.transformed_uv(uv, *transforms[material.name], v_down=True)
             tint = tuple((linear if linear is not None else np.ones(3)).tolist())
             key = (id(image), tint)
-            return replace(piece, uv=uv, image=tinted(texture, tint), image_key=key)
+            return replace(piece, uv=uv, image=mesh_atlas.tinted(texture, tint), image_key=key)
     elif image is not None:
         notes.append(_without_coordinates(f"the texture of '{name}'"))
     if is_gltf:
-        return replace(piece, color=None if linear is None else rgb8(linear))
+        return replace(piece, color=None if linear is None else mesh_atlas.rgb8(linear))
     if not folder.found:  # trimesh makes a material up where the file's own is missing
         return piece
     r, g, b = np.asarray(material.main_color, dtype=int)[:3].tolist()

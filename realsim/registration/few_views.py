@@ -15,6 +15,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.records.depth_bias import DepthBias
+from realsim.registration import near_start
 from realsim.registration.blind import Kept, keep_start
 from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import FRAMES, Comparer, make_comparer, spread_frames
@@ -29,15 +30,6 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.intake import Intake
-from realsim.registration.near_start import (
-    BestStart,
-    coarse_voxel,
-    drop_height,
-    fine_voxel,
-    free_space_of,
-    joint_fit,
-    search,
-)
 from realsim.registration.photo import Picture
 from realsim.registration.photo_fit import PhotoFit, photo_fit
 from realsim.registration.refinement.refine import area_at
@@ -73,7 +65,7 @@ class FewViews:
     kept: list[Kept]
     clouds: list[Cloud]
     """Each object's own points."""
-    found: list[BestStart]
+    found: list[near_start.BestStart]
     history: list[dict[str, Any]]
     plane: SupportPlane | None
     no_plane: str
@@ -95,7 +87,7 @@ def begin(
 
 def search_near(
     work: NearTask, bodies: Sequence[Body], tick: Callable[[], None]
-) -> list[BestStart]:
+) -> list[near_start.BestStart]:
     """Return of every body the pose near its start that explains the images best."""
     return [
         _search_one(work, body, near, tick)
@@ -232,21 +224,23 @@ def few_around(
     ]
 
 
-def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestStart:
+def _search_one(
+    work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]
+) -> near_start.BestStart:
     """Return the best hypothesis of one object, its neighbours not yet considered."""
     center = body.center(body.T_start)
     comparer = work.comparer(center)
-    free_space = free_space_of(comparer)
-    above = without_table(near, work.plane, drop_height(body, work.plane))
-    coarse = average_cloud(above, body.T_start, coarse_voxel(body))
-    fine = average_cloud(above, body.T_start, fine_voxel(body))
-    found = search(body, coarse, fine, comparer, free_space)
+    free_space = near_start.free_space_of(comparer)
+    above = without_table(near, work.plane, near_start.drop_height(body, work.plane))
+    coarse = average_cloud(above, body.T_start, near_start.coarse_voxel(body))
+    fine = average_cloud(above, body.T_start, near_start.fine_voxel(body))
+    found = near_start.search(body, coarse, fine, comparer, free_space)
     tick()
     return found
 
 
 def _joint(
-    work: NearTask, bodies: Sequence[Body], found: Sequence[BestStart]
+    work: NearTask, bodies: Sequence[Body], found: Sequence[near_start.BestStart]
 ) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
     """Return the fits of all objects together, the points of each, and the sweeps' history.
 
@@ -264,15 +258,15 @@ def _joint(
         near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
     clouds = [
         average_cloud(
-            without_table(cloud, work.plane, drop_height(body, work.plane)),
+            without_table(cloud, work.plane, near_start.drop_height(body, work.plane)),
             body.T_start,
-            fine_voxel(body),
+            near_start.fine_voxel(body),
         )
         for body, cloud in zip(bodies, near, strict=True)
     ]
     comparers = [work.comparer(b.center(T)) for b, T in zip(bodies, poses, strict=True)]
-    spaces = [free_space_of(c) for c in comparers]
-    fits, own, history = joint_fit(bodies, poses, clouds, (comparers, spaces))
+    spaces = [near_start.free_space_of(c) for c in comparers]
+    fits, own, history = near_start.joint_fit(bodies, poses, clouds, (comparers, spaces))
     kept = [
         keep_start(body, fit, data, config.covariance)
         for body, fit, data in zip(

@@ -11,18 +11,8 @@ from realsim.errors import InputError
 from realsim.geometry.depth import check_depth
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.records.depth_bias import DepthBias
+from realsim.registration import evidence
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import (
-    Cloud,
-    DepthFrame,
-    DepthNoise,
-    average_cloud,
-    correct_frame,
-    in_order,
-    measure_noise,
-    read_frame,
-    without_table,
-)
 from realsim.registration.find_table import find_table, looked_at
 from realsim.registration.fixed_cameras import FixedFrames, noise_of, still_depth
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
@@ -53,11 +43,11 @@ class Intake:
     """What all steps of a registration start from."""
 
     intrinsics: CameraIntrinsics
-    frames: tuple[DepthFrame, ...]
+    frames: tuple[evidence.DepthFrame, ...]
     """Sound frames in the order of their numbers, their depth's known bias taken out."""
     views: tuple[ViewPoints, ...]
     """Their trusted points."""
-    noise: DepthNoise
+    noise: evidence.DepthNoise
     plane: SupportPlane | None
     no_plane: str
     """Why there is no plane."""
@@ -89,7 +79,7 @@ def sampling(intrinsics: CameraIntrinsics, frames: int, config: RegistrationConf
 
 def take_in(
     intrinsics: CameraIntrinsics,
-    frames: Sequence[DepthFrame],
+    frames: Sequence[evidence.DepthFrame],
     config: RegistrationConfig,
     gravity_up_world: ArrayLike | None = None,
     progress: Callable[[], None] | None = None,
@@ -101,15 +91,15 @@ def take_in(
         InputError: there is no frame, two have the same number, an image is not the camera's, or
             no view is left.
     """
-    ordered = in_order(frames)
+    ordered = evidence.in_order(frames)
     if not config.bias.is_none:
-        ordered = [correct_frame(f, f.T_world_cam, config.bias) for f in ordered]
+        ordered = [evidence.correct_frame(f, f.T_world_cam, config.bias) for f in ordered]
     check_depth(ordered[0].depth_m, intrinsics)
     noise = _noise(ordered, config)
     sample = sampling(intrinsics, len(ordered), config)
     views: list[ViewPoints] = []
     for frame in ordered:
-        image = read_frame(frame)
+        image = evidence.read_frame(frame)
         check_depth(image.depth_m, intrinsics)
         views.append(sample_view(intrinsics, image, noise, sample))
         if progress is not None:
@@ -152,7 +142,7 @@ def _still_view(index: int, frames: FixedFrames, config: RegistrationConfig) -> 
         )
     except InputError as error:
         raise InputError(f"camera '{said.name}': {error}") from error
-    frame = DepthFrame(index=index, depth_m=depth, T_world_cam=camera.T_world_cam)
+    frame = evidence.DepthFrame(index=index, depth_m=depth, T_world_cam=camera.T_world_cam)
     sample = sampling(camera.intrinsics, 1, config)
     return replace(sample_view(camera.intrinsics, frame, camera.noise, sample), fixed=camera)
 
@@ -212,16 +202,18 @@ def neighbours_apart_deg(intake: Intake) -> float:
     return float(np.median(np.degrees(np.arccos(np.clip(cosines.max(1), -1.0, 1.0)))))
 
 
-def _noise(frames: Sequence[DepthFrame], config: RegistrationConfig) -> DepthNoise:
+def _noise(
+    frames: Sequence[evidence.DepthFrame], config: RegistrationConfig
+) -> evidence.DepthNoise:
     """Return the noise of some frames; if these are empty, of all that are not."""
     try:
-        return measure_noise(frames, config.evidence)
+        return evidence.measure_noise(frames, config.evidence)
     except InputError:
         whole = [f for f in frames if np.any(f.depth_m > 0)]
-        return measure_noise(whole or frames, config.evidence)
+        return evidence.measure_noise(whole or frames, config.evidence)
 
 
-def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> Cloud:
+def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> evidence.Cloud:
     """Return what stands on the table, all views together, averaged on voxels.
 
     Args:
@@ -236,6 +228,6 @@ def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> C
         replace(v, points=v.points[::every], T_world_cam=T)
         for v, T in zip(views, cameras, strict=True)
     ]
-    cloud = without_table(world_cloud(moved, intake.noise), plane, ABOVE_M)
+    cloud = evidence.without_table(world_cloud(moved, intake.noise), plane, ABOVE_M)
     T = np.eye(4) if plane is None else plane.T_world_table
-    return average_cloud(cloud, T, SCENE_VOXEL_M)
+    return evidence.average_cloud(cloud, T, SCENE_VOXEL_M)

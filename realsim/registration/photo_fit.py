@@ -23,17 +23,9 @@ from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
+from realsim.registration import photo
 from realsim.registration.body import Body, footprint, moved_about_center
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.photo import (
-    COMMON_PX,
-    EDGE_POINTS,
-    LEAST_PX,
-    TOGETHER,
-    Outline,
-    Picture,
-    outline_of,
-)
 from realsim.registration.solver import PoseFit
 
 LEAST_OFFSET_PER_M = 1e-4
@@ -77,7 +69,7 @@ SHARP = 12.0
 class Edges:
     """What the photograph says of one object, all others and what is common as they were fitted."""
 
-    picture: Picture
+    picture: photo.Picture
     body: Body
     others: Array32
     """(H, W) depth of all other objects; inf beside them [m]."""
@@ -100,7 +92,7 @@ class Edges:
         allow it. What is held against it is half the sum of squared residuals, each capped.
         """
         free = np.linalg.svd(held)[0][:, held.shape[1] :]
-        H, together = free.T @ self.information @ free, TOGETHER
+        H, together = free.T @ self.information @ free, photo.TOGETHER
         y, T = np.zeros(free.shape[1]), T_world_obj
         for _ in range(AMENDED):
             A, d = self._rows(T)
@@ -156,7 +148,7 @@ class PhotoFit:
 class _Seen:
     """The outline of one object, linearised."""
 
-    outline: Outline
+    outline: photo.Outline
     J: Array
     """(N, 6) of the distance along the normal, camera axes, about the centre [px/rad, px/m]."""
     others: Array32
@@ -164,7 +156,7 @@ class _Seen:
 
 
 def photo_fit(
-    picture: Picture, bodies: Sequence[Body], fits: Sequence[PoseFit], together: float,
+    picture: photo.Picture, bodies: Sequence[Body], fits: Sequence[PoseFit], together: float,
     noise: DepthNoise,
 ) -> PhotoFit:  # fmt: skip
     """Return poses that fit depth and photograph.
@@ -277,7 +269,9 @@ def _information(body: Body, fit: PoseFit, R_cam_obj: Array, together: float) ->
     return B @ H @ B.T
 
 
-def _outlines(picture: Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Array]) -> list[_Seen]:
+def _outlines(
+    picture: photo.Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Array]
+) -> list[_Seen]:
     """Return the outlines of all objects, each hidden by the others."""
     depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, Ts_cam_obj, strict=True)]
     out: list[_Seen] = []
@@ -288,10 +282,10 @@ def _outlines(picture: Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Arr
 
 
 def _outline(
-    picture: Picture, body: Body, T_cam_obj: Array, depth: Array32, others: Array32
+    picture: photo.Picture, body: Body, T_cam_obj: Array, depth: Array32, others: Array32
 ) -> _Seen:
     """Return the outline of one object."""
-    o = outline_of(picture, depth, others)
+    o = photo.outline_of(picture, depth, others)
     at = np.round(o.pixels - o.normals).astype(np.int64)
     z = depth[at[:, 1], at[:, 0]].astype(np.float64)
     o, at, z = o.part(np.isfinite(z)), at[np.isfinite(z)], z[np.isfinite(z)]
@@ -331,7 +325,7 @@ def _solved(
     """
     size, before = len(x), x
     prior = np.zeros(size)
-    prior[0], prior[1:3] = offset**-2, COMMON_PX**-2
+    prior[0], prior[1:3] = offset**-2, photo.COMMON_PX**-2
     prior[9::7] = EDGE_RIM_PX**-2
     base: Array = np.diag(prior)
     rows: list[tuple[Array, Array]] = []
@@ -347,16 +341,16 @@ def _solved(
         moved = np.zeros(size)
         moved[at] = before[at]
         rows.append((J, s.outline.offsets[found] + J @ moved))
-    sigmas: Array = np.full(len(bodies), LEAST_PX)
+    sigmas: Array = np.full(len(bodies), photo.LEAST_PX)
     A: Array = base
     for _ in range(8):
         A, b = base.copy(), np.zeros(size)
         for k, (J, d) in enumerate(rows):
-            if len(d) < EDGE_POINTS:
+            if len(d) < photo.EDGE_POINTS:
                 continue
             r = d - J @ x
-            sigmas[k] = max(1.48 * float(np.median(np.abs(r))), LEAST_PX)
-            w = _weights(r, float(sigmas[k])) / TOGETHER
+            sigmas[k] = max(1.48 * float(np.median(np.abs(r))), photo.LEAST_PX)
+            w = _weights(r, float(sigmas[k])) / photo.TOGETHER
             A += J.T @ (w[:, None] * J)
             b += J.T @ (w * d)
         x = np.asarray(np.linalg.solve(A, b), dtype=np.float64)

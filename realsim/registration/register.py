@@ -19,6 +19,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
+from realsim.registration import second_look
 from realsim.registration.blind import Kept, Uncertainty, uncertainty
 from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import spread_frames
@@ -62,16 +63,6 @@ from realsim.registration.reports import (
 )
 from realsim.registration.rivals_around import Around, integrated
 from realsim.registration.search.records import NotPlaced, Wanted
-from realsim.registration.second_look import (
-    NO_TABLE,
-    camera_moves,
-    far_moved,
-    is_beside_objects,
-    odd_views,
-    unsure,
-    views_off,
-    without_views,
-)
 from realsim.registration.top_down import not_seen, top_down_poses
 from realsim.registration.views import ViewPoints
 
@@ -196,11 +187,13 @@ def _fit_many(
     # Of what nobody named, a model may have been laid into one place many times.
     found_models = {b.model.obj_id: b.model for b in found.bodies}
     wanted = [task.models[w.obj_id] for w in asked] or list(found_models.values())
-    if many.plane is not None and not is_beside_objects(many, found.bodies, many.plane, wanted):
-        looked = replace(looked, plane=None, no_plane=NO_TABLE)
-    moves = camera_moves(many, found.bodies)
-    if odd := odd_views(looked, moves, config.refine_from):
-        looked = without_views(looked, odd)
+    if many.plane is not None and not second_look.is_beside_objects(
+        many, found.bodies, many.plane, wanted
+    ):
+        looked = replace(looked, plane=None, no_plane=second_look.NO_TABLE)
+    moves = second_look.camera_moves(many, found.bodies)
+    if odd := second_look.odd_views(looked, moves, config.refine_from):
+        looked = second_look.without_views(looked, odd)
     if looked is not intake:
         intake, task = looked, replace(task, intake=looked)
         many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
@@ -229,7 +222,7 @@ def _fit_many(
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     numbers = [f.index for f in intake.frames]
-    moved = far_moved(camera_moves(many, claimed), config)
+    moved = second_look.far_moved(second_look.camera_moves(many, claimed), config)
     return task, found, _Fit(
         poses=poses, frames=many.frames, views=many.hand_views,
         fixed=many.views[len(many.frames):], kept=many.kept, uncertain=uncertain,
@@ -240,7 +233,7 @@ def _fit_many(
             }
             for v, number in enumerate(numbers)
         },
-        findings=[*moved, *views_off(intake, many, claimed)],
+        findings=[*moved, *second_look.views_off(intake, many, claimed)],
         report={"refinement": camera_report(many, claimed, numbers)},
     )  # fmt: skip
 
@@ -377,7 +370,7 @@ def _registration(
     task.tick()
     single, single_report = top_down_poses(task, given, comparer)
     task.tick()
-    objects = unsure(judgement.objects, fit.findings)
+    objects = second_look.unsure(judgement.objects, fit.findings)
     scene = Scene(name=task.name, objects=objects, plane=given.plane)
     baseline = Scene(name=f"{task.name} (single view)", objects=tuple(single), plane=given.plane)
     cameras = {f.index: T for f, T in zip(intake.frames, given.cameras, strict=False)}

@@ -11,15 +11,8 @@ from realsim.geometry.dh import DhArm
 from realsim.geometry.normal_equations import inverse
 from realsim.records import CameraIntrinsics
 from realsim_calibration.calibrate import CalibrationConfig, determined_priors
+from realsim_calibration.cameras import faults
 from realsim_calibration.cameras.checks import armless_checks, rig_checks
-from realsim_calibration.cameras.faults import (
-    FEW_VIEWS,
-    require_distinct,
-    require_lenses,
-    require_motion,
-    require_sightings,
-    require_sizes,
-)
 from realsim_calibration.cameras.problem import RigProblem, first_state
 from realsim_calibration.cameras.results import (
     ROBOT_BASE,
@@ -66,17 +59,17 @@ def calibrate_cameras(
         DegenerateError: the views do not determine a lens or a place; says what to add.
     """
     config = config or CalibrationConfig()
-    require_distinct(rig.boards)
-    require_sightings(rig)
-    require_sizes(rig)
+    faults.require_distinct(rig.boards)
+    faults.require_sightings(rig)
+    faults.require_sizes(rig)
     try:
         lenses, joints, own = _lenses(rig, config)
     except DegenerateError:
         # A board said to move that stands still tells no lens: then that is the cause to name.
-        require_motion(rig, board_poses(rig, _rough_lenses(rig), config.hand_eye)[0])
+        faults.require_motion(rig, board_poses(rig, _rough_lenses(rig), config.hand_eye)[0])
         raise
-    require_lenses(rig, own, FOCAL_SHARE[0])
-    require_motion(rig, board_poses(rig, lenses, config.hand_eye)[0])
+    faults.require_lenses(rig, own, FOCAL_SHARE[0])
+    faults.require_motion(rig, board_poses(rig, lenses, config.hand_eye)[0])
     start = find_start(rig, lenses, config.hand_eye, arm)
     rows = sorted({s.instant for s in start.rig.sightings})
     used = _only_instants(start.rig, rows)
@@ -128,7 +121,7 @@ def _lenses(
     for c, camera in enumerate(rig.cameras):
         report, views, said = _own_lens(rig, c, config)
         given = camera.intrinsics0
-        if given is None and views < FEW_VIEWS:
+        if given is None and views < faults.FEW_VIEWS:
             raise InputError(
                 f"camera '{camera.name}' sees a board in {views} of "
                 f"{len({s.instant for s in rig.of_camera(c)})} images: its place can be found from "
@@ -250,7 +243,7 @@ def _camera(
     b = max(
         range(len(rig.boards)),
         key=lambda b: (
-            rig.moves(c, b) * names.count(rig.boards[b].name) >= FEW_VIEWS,
+            rig.moves(c, b) * names.count(rig.boards[b].name) >= faults.FEW_VIEWS,
             names.count(rig.boards[b].name),
             -b,
         ),

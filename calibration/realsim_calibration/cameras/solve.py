@@ -17,24 +17,9 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.cameras.problem import RigModel, RigProblem, RigState
+from realsim_calibration.fit import joint_solve, noise_scale
 from realsim_calibration.fit.board_pose import refine_board_pose
-from realsim_calibration.fit.joint_solve import (
-    JointProblem,
-    JointState,
-    Setup,
-    ViewCorners,
-    shaped_points,
-    smooth_errors,
-)
 from realsim_calibration.fit.linear_model import LinearFit
-from realsim_calibration.fit.noise_scale import (
-    NoiseConfig,
-    Whiteness,
-    estimate_arm,
-    estimate_ratio,
-    largest_ratio,
-    whiteness,
-)
 from realsim_calibration.fit.robot_error import ErrorBasis, arm_basis, map_record
 from realsim_calibration.fit.robust_fit import (
     Choice,
@@ -110,8 +95,8 @@ def solve_rig(
         sigmas, roots = spread(problem, state, sigmas, config)
     model = RigModel(problem, state, sigmas, roots)
     whites = _whiteness(problem, state, noise)
-    most = min(largest_ratio(w, noise) for w in whites)
-    ratio = estimate_ratio(model, None, 1.0, most, noise)
+    most = min(noise_scale.largest_ratio(w, noise) for w in whites)
+    ratio = noise_scale.estimate_ratio(model, None, 1.0, most, noise)
     none = Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, 1.0))
     choices, known = [none], None
     Ts = state.A
@@ -119,13 +104,13 @@ def solve_rig(
         choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise.bound))
         if arm is not None and joints is not None:
             basis = arm_basis(arm, joints, Ts)
-            arm_ratio, known = estimate_arm(model, basis, 1.0, noise)
+            arm_ratio, known = noise_scale.estimate_arm(model, basis, 1.0, noise)
             fit = model.fit(known, arm_ratio, 1.0)
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
     best = chosen_of(choices)
     ratio = best.ratio
     if best.basis is not None and best.basis.kind != "arm":
-        ratio = estimate_ratio(model, best.basis, 1.0, most, noise)
+        ratio = noise_scale.estimate_ratio(model, best.basis, 1.0, most, noise)
     alone = model.moved(none.fit.step, None, none.ratio)
     state = model.moved(best.fit.step, best.basis, ratio)
     state = optimize(problem, state, best.basis, ratio, sigmas, roots, config)
@@ -202,7 +187,9 @@ def spread(
     return np.sqrt(np.maximum(total, 1e-12) / np.maximum(count, 1.0)), roots
 
 
-def _whiteness(problem: RigProblem, state: RigState, config: NoiseConfig) -> list[Whiteness]:
+def _whiteness(
+    problem: RigProblem, state: RigState, config: noise_scale.NoiseConfig
+) -> list[noise_scale.Whiteness]:
     """Return whether corners are independent inside the views of every camera and board.
 
     A free pose a view is fitted, so that only lens and board matter: its pose stands for the arm's.
@@ -211,29 +198,29 @@ def _whiteness(problem: RigProblem, state: RigState, config: NoiseConfig) -> lis
     groups: dict[tuple[int, int], list[int]] = {}
     for k, view in enumerate(problem.views):
         groups.setdefault((view.camera, view.board), []).append(k)
-    found: list[Whiteness] = []
+    found: list[noise_scale.Whiteness] = []
     for (c, b), ks in sorted(groups.items()):
         size = ks[0]
         image = problem.rig.sightings[size].detection.image_size
         corners = tuple(
-            ViewCorners(index=k, T_base_ee=np.ascontiguousarray(Ts[k]),
+            joint_solve.ViewCorners(index=k, T_base_ee=np.ascontiguousarray(Ts[k]),
                         xy=problem.views[k].xy, uv=problem.views[k].uv)
             for k in ks
         )  # fmt: skip
-        one = JointProblem(
-            Setup(views=corners, to_hand=True, middle=problem.middles[b],
+        one = joint_solve.JointProblem(
+            joint_solve.Setup(views=corners, to_hand=True, middle=problem.middles[b],
                   half_extent=problem.halves[b],
                   intrinsics0=camera_record(state.lens[c], image)),
             problem.joints[c],
         )  # fmt: skip
-        at = JointState(
+        at = joint_solve.JointState(
             X=np.eye(4), Z=np.eye(4), camera=state.lens[c], board=state.shape[b],
             weights=np.zeros(0), errors=np.zeros((len(ks), 6)),
         )  # fmt: skip
-        white = whiteness(one, at, config)
+        white = noise_scale.whiteness(one, at, config)
         if np.isfinite(white.ratio):
             found.append(white)
-    return found or [Whiteness(ratio=float("nan"), sd=float("nan"))]
+    return found or [noise_scale.Whiteness(ratio=float("nan"), sd=float("nan"))]
 
 
 def _hidden(
@@ -323,7 +310,7 @@ def doubted_instants(solution: RigSolution) -> list[int]:
     Several cameras, or one and the board's shape, place the hand there; the pose is not needed.
     """
     problem, state = solution.problem, solution.state
-    smooth = smooth_errors(solution.basis, state.weights, len(problem.at))
+    smooth = joint_solve.smooth_errors(solution.basis, state.weights, len(problem.at))
     sd = np.repeat(solution.ratio, 3) * solution.model.unit_sd
     off = np.linalg.norm((state.errors - smooth) / np.where(sd > 0, sd, np.inf), axis=-1)
     arm = [
@@ -366,7 +353,7 @@ def unseen_views(solution: RigSolution) -> list[UnseenView]:
     own views, all of them.
     """
     problem, state, basis = solution.problem, solution.state, solution.basis
-    smooth = smooth_errors(basis, state.weights, len(problem.at))
+    smooth = joint_solve.smooth_errors(basis, state.weights, len(problem.at))
     seen = problem.residuals(_settled(problem, state, smooth, solution.sigmas))
     found: dict[int, UnseenView] = {}
     S = problem.size
@@ -377,7 +364,7 @@ def unseen_views(solution: RigSolution) -> list[UnseenView]:
         unseen = problem.residuals(moved, views)
         for k, r, expected in zip(views, unseen, problem.poses(moved, views), strict=True):
             view = problem.views[k]
-            points = shaped_points(
+            points = joint_solve.shaped_points(
                 moved.shape[view.board], view.xy, problem.middles[view.board],
                 problem.halves[view.board],
             )  # fmt: skip

@@ -15,14 +15,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask, UInt8
 from realsim.records import CameraIntrinsics
-from realsim_calibration.detect.edges import (
-    bend,
-    bilinear,
-    fit_blurred_steps,
-    fit_lines,
-    line_intersections,
-    straighten,
-)
+from realsim_calibration.detect import edges
 
 NO_PATTERN_PX = 1e3
 """Distance of the next edge behind a chessboard's edge: beyond any profile [px]."""
@@ -152,10 +145,12 @@ def _measure(
     flip = dark[:, None] ^ (np.arange(4) % 2 == 1)
     side = np.where(flip[..., None], -side, side)
     t = np.linspace(-1.0, 1.0, SAMPLES) * reach[..., None]
-    profiles = bilinear(
+    profiles = edges.bilinear(
         image, foot[..., None, :] + t[..., None, :, None] * side[..., None, None, :]
     )
-    shift, step, blur = fit_blurred_steps(t, profiles, np.full(length.shape, NO_PATTERN_PX), blur)
+    shift, step, blur = edges.fit_blurred_steps(
+        t, profiles, np.full(length.shape, NO_PATTERN_PX), blur
+    )
     seen = (np.abs(shift) < 0.9 * reach[..., None]) & (
         step > 0.3 * np.median(step, axis=(1, 2))[:, None, None]
     )
@@ -164,12 +159,12 @@ def _measure(
     points = np.concatenate([points[:, :2], points[:, 2:]], axis=2)
     seen = np.concatenate([seen[:, :2], seen[:, 2:]], axis=2)
     s = np.concatenate([s[:, :2], -s[:, 2:]], axis=2)
-    center, normal, weight, rms = fit_lines(straighten(intrinsics, points), seen)
-    met, sine = line_intersections(center[:, 0], normal[:, 0], center[:, 1], normal[:, 1])
+    center, normal, weight, rms = edges.fit_lines(edges.straighten(intrinsics, points), seen)
+    met, sine = edges.line_intersections(center[:, 0], normal[:, 0], center[:, 1], normal[:, 1])
     met = np.clip(met, uv - 2 * HALF_WINDOW_PX, uv + 2 * HALF_WINDOW_PX)
     variance = _variance(s, weight, rms)
     return _Pass(
-        uv=bend(intrinsics, met),
+        uv=edges.bend(intrinsics, met),
         toward=_turned(toward, met, normal, length, intrinsics),
         blur=blur,
         contrast=np.median(step, axis=-1).min(-1),
@@ -201,8 +196,8 @@ def _turned(
     tangent = np.stack([normal[..., 1], -normal[..., 0]], -1)
     tangent = np.concatenate([tangent, tangent], axis=1)
     tangent = tangent * np.where((tangent * toward).sum(-1) < 0, -1.0, 1.0)[..., None]
-    tip = bend(intrinsics, met[:, None] + tangent * length[..., None])
-    out = tip - bend(intrinsics, met)[:, None]
+    tip = edges.bend(intrinsics, met[:, None] + tangent * length[..., None])
+    out = tip - edges.bend(intrinsics, met)[:, None]
     out = out / np.maximum(np.linalg.norm(out, axis=-1), 1e-9)[..., None]
     # A line that turned by more than 30 deg has found something else: keep the old direction.
     return np.where(((out * toward).sum(-1) > np.cos(np.pi / 6))[..., None], out, toward)

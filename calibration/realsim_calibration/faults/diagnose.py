@@ -19,26 +19,8 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
-from realsim_calibration.faults import pairing
+from realsim_calibration.faults import diagnosis, pairing
 from realsim_calibration.faults.copied_views import Groups, find_copies
-from realsim_calibration.faults.diagnosis import (
-    ACCEPT_SCORE,
-    DECISIVE,
-    DOUBTFUL_SCORE,
-    FEW_VIEWS,
-    GAIN,
-    GAIN_FEW,
-    LEAST_TURN_DEG,
-    MAX_SIZE_RATIO,
-    SIZE_SIGMAS,
-    SURE_SCORE,
-    TIE,
-    Diagnosis,
-    Evidence,
-    Fault,
-    ReadingFit,
-    ReadingProof,
-)
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.hypotheses import (
     Hypothesis,
@@ -117,7 +99,7 @@ def diagnose(
     target: Target | None = None,
     nominal: ArrayLike | None = None,
     mode: Mode = "eye_in_hand",
-) -> Diagnosis:
+) -> diagnosis.Diagnosis:
     """Return the most plausible single fault of the poses, with evidence and, if possible, repair.
 
     Args:
@@ -157,13 +139,13 @@ def diagnose(
     return _diagnosis(p, found, tried)
 
 
-def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> Diagnosis:
-    table: list[Evidence] = []
+def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> diagnosis.Diagnosis:
+    table: list[diagnosis.Evidence] = []
     for other in tried:
         if len(other.T) >= MIN_VIEWS and other.name not in {e.hypothesis for e in table}:
             table.append(evidence_of(other, p.eye_in_hand))
     mended = bool(h.note)
-    return Diagnosis(
+    return diagnosis.Diagnosis(
         fault=h.fault, sentence=h.sentence, advice=h.advice, views=h.views,
         labels=tuple(p.labels[k] for k in h.views), evidence=tuple(table[:LISTED]),
         length_ratio=h.fit.length_ratio, ratio_sd=h.fit.ratio_sd,
@@ -172,7 +154,9 @@ def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> Diagnosi
     )  # fmt: skip
 
 
-def _without_copies(p: Poses, groups: dict[Fault, Groups]) -> tuple[Int64, Hypothesis | None]:
+def _without_copies(
+    p: Poses, groups: dict[diagnosis.Fault, Groups]
+) -> tuple[Int64, Hypothesis | None]:
     """Return the rows that repeat nothing, and what the others are."""
     n = len(p.T)
     every = np.arange(n)
@@ -191,7 +175,7 @@ def _without_copies(p: Poses, groups: dict[Fault, Groups]) -> tuple[Int64, Hypot
             best = min(group, key=lambda k: errors[k])
             kept += [best] if errors[best] <= gate else []
     rows = np.array(sorted(set(kept) - spare), dtype=np.int64)
-    fault: Fault = next(kind for kind, found in groups.items() if found)
+    fault: diagnosis.Fault = next(kind for kind, found in groups.items() if found)
     text = {
         "frozen_pose": ("share one hand pose to the last digit although their images differ: the "
                         "controller delivered an old pose", "Read the pose after the arm has "
@@ -219,7 +203,7 @@ def _search(p: Poses, nominal: Array | None) -> tuple[Hypothesis, list[Hypothesi
     given = simple(p, "none", "as given", p.T, p.C)
     if (reason := _untestable(p)) is not None:
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
-    if given.score <= SURE_SCORE and given.fit.errors.max() <= pairing.FLOOR:
+    if given.score <= diagnosis.SURE_SCORE and given.fit.errors.max() <= pairing.FLOOR:
         return _sound(p, given, nominal), [given]
     tried = [inverted(p), *mirrored(p)]
     tried += [h for h in (flipped_boards(p), paired_otherwise(p), moved(p))
@@ -227,10 +211,10 @@ def _search(p: Poses, nominal: Array | None) -> tuple[Hypothesis, list[Hypothesi
     tried += reread_rotations(p, thorough=False)
     best = _best(given, tried)
     # Slow but complete, for poses too few or too parallel for a vote.
-    if given.score > ACCEPT_SCORE and _doubtful(best):
+    if given.score > diagnosis.ACCEPT_SCORE and _doubtful(best):
         tried += reread_rotations(p, thorough=True)
         best = _best(given, tried)
-    if best is None and given.score > ACCEPT_SCORE:
+    if best is None and given.score > diagnosis.ACCEPT_SCORE:
         tried += reread_as_degrees(p)
         best = _best(given, tried)
     listed = [given, *sorted(tried, key=lambda h: h.score)]
@@ -244,7 +228,7 @@ def _search(p: Poses, nominal: Array | None) -> tuple[Hypothesis, list[Hypothesi
             if offset.known and len(offset.offsets) > 1:
                 figures += f" {offset.sentence}"
         return replace(best, sentence=best.sentence + figures), listed
-    if given.score <= ACCEPT_SCORE:
+    if given.score <= diagnosis.ACCEPT_SCORE:
         return _sound(p, given, nominal), listed
     return _unknown(given, tried), listed
 
@@ -270,28 +254,30 @@ def _mm(h: Hypothesis) -> str:
 
 def _doubtful(best: Hypothesis | None) -> bool:
     return best is None or (
-        best.fault in ("rotation_reading", "radians_as_degrees") and best.score > DOUBTFUL_SCORE
+        best.fault in ("rotation_reading", "radians_as_degrees")
+        and best.score > diagnosis.DOUBTFUL_SCORE
     )
 
 
 def _best(given: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis | None:
     """Return the reading that fits far better than the given one, the simplest of equals."""
-    gain = GAIN if len(given.T) >= FEW_VIEWS else GAIN_FEW
+    gain = diagnosis.GAIN if len(given.T) >= diagnosis.FEW_VIEWS else diagnosis.GAIN_FEW
     fitting = [
         h
         for h in tried
-        if h.score <= ACCEPT_SCORE and h.score * (gain if h.gain is None else h.gain) < given.score
+        if h.score <= diagnosis.ACCEPT_SCORE
+        and h.score * (gain if h.gain is None else h.gain) < given.score
     ]
     if not fitting:
         return None
-    limit = TIE * min(h.score for h in fitting)
+    limit = diagnosis.TIE * min(h.score for h in fitting)
     return next(h for h in fitting if h.score <= limit)
 
 
 def _untestable(p: Poses) -> tuple[str, str] | None:
     """Return why conventions cannot be tested, None where they can."""
     second = [np.degrees(principal_turns(m.turns)[0][1]) for m in motions(p.T, p.C)]
-    if max(second) >= LEAST_TURN_DEG:
+    if max(second) >= diagnosis.LEAST_TURN_DEG:
         return None
     return (
         f"Hand and camera turn by only {second[0]:.2f} and {second[1]:.2f} deg (RMS) about their "
@@ -313,7 +299,7 @@ def _sound(p: Poses, given: Hypothesis, nominal: Array | None) -> Hypothesis:
             C[:, :3, 3] /= factor
             return _unit(p, "board_unit", "board poses", unit, ratio, p.T, C)
     off = abs(np.log(ratio))
-    if off > np.log(MAX_SIZE_RATIO) and off > SIZE_SIGMAS * sd:
+    if off > np.log(diagnosis.MAX_SIZE_RATIO) and off > diagnosis.SIZE_SIGMAS * sd:
         C = p.C.copy()
         C[:, :3, 3] *= ratio
         h = simple(p, "board_size", "board scaled", p.T, C)
@@ -341,7 +327,7 @@ def _sound(p: Poses, given: Hypothesis, nominal: Array | None) -> Hypothesis:
 def _with_tool(p: Poses, none: Hypothesis, nominal: Array) -> Hypothesis:
     """Return what the nominal kinematics add to sound poses."""
     offset = tool_offset(p.T, nominal)
-    fault: Fault = "none"
+    fault: diagnosis.Fault = "none"
     if offset.known and offset.active:
         fault = "tool_change" if len(offset.offsets) > 1 else "tool_offset"
     elif offset.known and offset.base_turned:
@@ -354,7 +340,7 @@ def _with_tool(p: Poses, none: Hypothesis, nominal: Array) -> Hypothesis:
 
 
 def _unit(
-    p: Poses, fault: Fault, what: str, unit: str, ratio: float, T: Array, C: Array,
+    p: Poses, fault: diagnosis.Fault, what: str, unit: str, ratio: float, T: Array, C: Array,
 ) -> Hypothesis:  # fmt: skip
     h = simple(p, fault, f"{what} in {unit}", T, C)
     return replace(
@@ -369,7 +355,7 @@ def prove_reading(
     Ts_cam_board: ArrayLike,
     *,
     target: Target | None = None,
-) -> ReadingProof:
+) -> diagnosis.ReadingProof:
     """Return which reading of a pose file fits the images, for both places of the camera.
 
     A fixed camera with the poses T is the same equation as a camera in the hand with T inverted:
@@ -389,7 +375,7 @@ def prove_reading(
         raise InputError("prove_reading: no reading was given; at least one is needed.")
     middle = np.zeros(3) if target is None else target.points_board.mean(0)
     modes: tuple[Mode, Mode] = ("eye_in_hand", "eye_to_hand")
-    entries: list[tuple[ReadingFit, Array, bool]] = []
+    entries: list[tuple[diagnosis.ReadingFit, Array, bool]] = []
     read = [(name, se3.check_rigid(T, name).reshape(-1, 4, 4)) for name, T in candidates]
     # The inverse read for the other place of the camera is the same equation: it is fitted once.
     fits: dict[bytes, FrameFit] = {}
@@ -404,14 +390,14 @@ def prove_reading(
         # What sits in the hand is nearer to it than what stands in the base.
         natural = bool(x < z if mode == "eye_in_hand" else z < x)
         penalised = fit.score * (1 + abs(float(np.log(fit.length_ratio))) / np.log(1.5))
-        row = ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True),
+        row = diagnosis.ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True),
                          penalised=penalised)  # fmt: skip
         entries.append((row, A, natural))
     entries.sort(key=lambda e: e[0].penalised * (1.0 if e[2] else 1.01))
     return _proof(entries)
 
 
-def _proof(entries: list[tuple[ReadingFit, Array, bool]]) -> ReadingProof:
+def _proof(entries: list[tuple[diagnosis.ReadingFit, Array, bool]]) -> diagnosis.ReadingProof:
     best, A, natural = entries[0]
     same = [
         e for e in entries[1:]
@@ -421,8 +407,8 @@ def _proof(entries: list[tuple[ReadingFit, Array, bool]]) -> ReadingProof:
     others = [e for e in entries[1:] if all(e is not s for s in same)]
     runner = others[0][0] if others else None
     ratio = runner.penalised / max(best.penalised, 1e-12) if runner else float("inf")
-    fits = best.evidence.score <= ACCEPT_SCORE
-    decisive = bool(fits and ratio >= DECISIVE)
+    fits = best.evidence.score <= diagnosis.ACCEPT_SCORE
+    decisive = bool(fits and ratio >= diagnosis.DECISIVE)
     e = best.evidence
     text = (
         f"Read as {best.name}, {best.mode.replace('_', ' ')}, hand and camera agree to "
@@ -442,7 +428,7 @@ def _proof(entries: list[tuple[ReadingFit, Array, bool]]) -> ReadingProof:
             f"The same poses inverted would fit {twin} exactly as well; the size of the frames "
             "speaks against this place of the camera: say where it sits."
         )
-    return ReadingProof(
+    return diagnosis.ReadingProof(
         fits=tuple(entry[0] for entry in entries), best=best.name, best_mode=best.mode,
         equivalent=tuple(f"{s[0].name} ({s[0].mode})" for s in same),
         ratio=float(ratio), decisive=decisive, mode_sure=natural, sentence=text.strip(),

@@ -8,16 +8,7 @@ import numpy as np
 from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.faults import pairing
-from realsim_calibration.faults.diagnosis import (
-    ACCEPT_DEGREES,
-    GAIN_GROSS,
-    GROSS_ERROR,
-    PLAUSIBLE_OFF_AXIS,
-    SMALL_TURN_PART,
-    Evidence,
-    Fault,
-)
+from realsim_calibration.faults import diagnosis, pairing
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.gates import rotation_mismatch_deg, screw_ratio
 from realsim_calibration.faults.half_turns import synchronise_half_turns
@@ -73,7 +64,7 @@ class Poses:
 class Hypothesis:
     """One reading of the data and how it fits."""
 
-    fault: Fault
+    fault: diagnosis.Fault
     name: str
     """For the table of evidence."""
     fit: FrameFit
@@ -93,13 +84,13 @@ class Hypothesis:
     """How many times better than as given it must fit; None = as configured."""
 
 
-def evidence_of(h: Hypothesis, eye_in_hand: bool) -> Evidence:
+def evidence_of(h: Hypothesis, eye_in_hand: bool) -> diagnosis.Evidence:
     """Return the row of the table for a hypothesis."""
     A = hand_side(h.T, eye_in_hand)
     ratio = h.fit.length_ratio
     # Camera lengths that are a thousandth of the hand's number are metres, others millimetres.
     unit = 1.0 if ratio < SMALL_RATIO else 1e3
-    return Evidence(
+    return diagnosis.Evidence(
         hypothesis=h.name,
         rotation_mismatch_deg=rotation_mismatch_deg(A, h.C),
         screw_ratio=screw_ratio(A, h.C),
@@ -120,7 +111,7 @@ def _whole(n: int) -> Rows:
     return np.stack([np.arange(n), np.arange(n)], -1)
 
 
-def simple(p: Poses, fault: Fault, name: str, T: Array, C: Array) -> Hypothesis:
+def simple(p: Poses, fault: diagnosis.Fault, name: str, T: Array, C: Array) -> Hypothesis:
     """Return a hypothesis that keeps every view, still without words."""
     fit = p.fit(T, C)
     return Hypothesis(
@@ -145,7 +136,7 @@ def inverted(p: Poses) -> Hypothesis:
     front, off = _off_axis(p.C, p.middle)
     other_front, other_off = _off_axis(other, p.middle)
     behind = other_front and not front
-    aside = other_front and front and off > PLAUSIBLE_OFF_AXIS * other_off
+    aside = other_front and front and off > diagnosis.PLAUSIBLE_OFF_AXIS * other_off
     if behind or aside:
         where = "behind the camera" if behind else f"{np.degrees(off):.0f} deg off its axis"
         return replace(
@@ -230,7 +221,7 @@ def reread_rotations(p: Poses, *, thorough: bool) -> list[Hypothesis]:
         for r in readings
     ]  # fmt: skip
     hand, cam = (float(np.sqrt(np.mean(np.sum(m.turns**2, -1)))) for m in motions(p.T, p.C))
-    if hand < SMALL_TURN_PART * cam:
+    if hand < diagnosis.SMALL_TURN_PART * cam:
         scale = float(np.degrees(1.0))
         readings = every_reading(R, scale) if thorough else reread(R, t, D, scale)
         found += [
@@ -266,7 +257,7 @@ def reread_as_degrees(p: Poses) -> list[Hypothesis]:
     return [
         replace(h, note="", advice=f"{h.advice} The poses as decoded have lost the degrees.")
         for h in found
-        if h.score <= ACCEPT_DEGREES
+        if h.score <= diagnosis.ACCEPT_DEGREES
     ]
 
 
@@ -277,7 +268,7 @@ def _predicted_rotations(p: Poses, h: Hypothesis) -> Array:
     return A if p.eye_in_hand else np.swapaxes(A, -1, -2)
 
 
-def _reread(p: Poses, fault: Fault, r: Reread, sentence: str) -> Hypothesis:
+def _reread(p: Poses, fault: diagnosis.Fault, r: Reread, sentence: str) -> Hypothesis:
     T = se3.from_rt(r.Rs, p.T[:, :3, 3])
     reading = reading_of(r.meant)
     flag = "" if reading is None else f": --reading {reading} (mm for m if the file holds them)"
@@ -303,9 +294,9 @@ def paired_otherwise(p: Poses) -> Hypothesis | None:
     A = hand_side(p.T, p.eye_in_hand)
     bad = np.diag(mismatch(found.fit, A, p.C))[list(views)]
     # A few views among many hardly move the score, but each is far off by itself.
-    gross = fault != "shifted_pairing" and bool(np.all(bad > GROSS_ERROR))
+    gross = fault != "shifted_pairing" and bool(np.all(bad > diagnosis.GROSS_ERROR))
     return Hypothesis(
-        gain=GAIN_GROSS if gross else None,
+        gain=diagnosis.GAIN_GROSS if gross else None,
         fault=fault, name=name, fit=found.fit, score=score, T=p.T[found.rows[:, 0]],
         C=p.C[found.rows[:, 1]], rows=found.rows, sentence=sentence, views=views,
         advice="Pair by file name or time stamp, never by position in a list: a failed detection "
@@ -315,7 +306,7 @@ def paired_otherwise(p: Poses) -> Hypothesis | None:
     )  # fmt: skip
 
 
-def _pairing_text(p: Poses, found: Pairing) -> tuple[Fault, str, str, tuple[int, ...]]:
+def _pairing_text(p: Poses, found: Pairing) -> tuple[diagnosis.Fault, str, str, tuple[int, ...]]:
     """Return fault, name, sentence and views of a pairing; "none" where it is the given one."""
     shifts = found.shifts
     if shifts.any():
@@ -373,7 +364,9 @@ def moved(p: Poses) -> Hypothesis | None:
     A[m.start :] = A[m.start :] @ se3.invert(m.step) if m.frame == "X" else m.step @ A[m.start :]
     T[m.start :] = A[m.start :] if p.eye_in_hand else se3.invert(A[m.start :])
     hand = (m.frame == "X") == p.eye_in_hand
-    fault: Fault = "tool_change" if hand else "board_moved" if p.eye_in_hand else "camera_moved"
+    fault: diagnosis.Fault = (
+        "tool_change" if hand else "board_moved" if p.eye_in_hand else "camera_moved"
+    )
     what = {
         "tool_change": f"{'camera' if p.eye_in_hand else 'board'} sits elsewhere in the hand",
         "board_moved": "board stands elsewhere",

@@ -16,14 +16,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask, Rows
 from realsim.geometry import se3
-from realsim_calibration.faults.frame_fit import (
-    AGREE,
-    CAP,
-    FrameFit,
-    fit_frames,
-    mean_transform,
-    mismatch,
-)
+from realsim_calibration.faults import frame_fit
 from realsim_calibration.fit.closed_forms import MIN_VIEWS
 
 MovedFrame = Literal["X", "Z"]
@@ -72,7 +65,7 @@ class Pairing:
     """Rows of images that fit no pose, or that of another image; they are left out of `rows`."""
     elsewhere: tuple[tuple[int, int], ...]
     """(image row, pose row) of strays whose pose was found."""
-    fit: FrameFit
+    fit: frame_fit.FrameFit
     """Frames fitted to `rows`."""
 
 
@@ -100,8 +93,8 @@ def find_pairing(A: Array, C: Array, middle: Array) -> Pairing | None:
     result: Pairing | None = None
     # Twice: the first frames come from a part of the views, the second from all that were paired.
     for _ in range(2):
-        table = mismatch(fit, A, C)
-        paired = table[table < FLOOR * AGREE]
+        table = frame_fit.mismatch(fit, A, C)
+        paired = table[table < FLOOR * frame_fit.AGREE]
         usual = float(np.median(np.min(table, 0))) if len(paired) else np.inf
         gate = max(RATIO * usual, FLOOR)
         shifts = _path(table, gate)
@@ -112,21 +105,21 @@ def find_pairing(A: Array, C: Array, middle: Array) -> Pairing | None:
     return result
 
 
-def _best_stretch(A: Array, C: Array, middle: Array) -> FrameFit | None:
+def _best_stretch(A: Array, C: Array, middle: Array) -> frame_fit.FrameFit | None:
     """Return the frames of the most consistent stretch: all, the first or the second half."""
     n = len(A)
-    fits: list[FrameFit] = []
+    fits: list[frame_fit.FrameFit] = []
     for shift in range(-MAX_SHIFT, MAX_SHIFT + 1):
         a, c = A[max(shift, 0) : n + min(shift, 0)], C[max(-shift, 0) : n - max(shift, 0)]
         half = len(a) // 2
         for part in (slice(None), slice(half), slice(half, None)):
             if len(a[part]) >= MIN_VIEWS + 1:
-                fits.append(fit_frames(a[part], c[part], middle))
+                fits.append(frame_fit.fit_frames(a[part], c[part], middle))
     if not fits:
         return None
     # A few views fit wrong frames by chance: the stretch that explains most of the table wins.
     fits.sort(key=lambda f: f.usual)
-    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C)))
+    return min(fits[:6], key=lambda f: _explained(frame_fit.mismatch(f, A, C)))
 
 
 def _explained(table: Array) -> float:
@@ -134,7 +127,7 @@ def _explained(table: Array) -> float:
     n = len(table)
     i, j = np.indices((n, n))
     near = np.where(np.abs(i - j) <= MAX_SHIFT, table, np.inf)
-    return float(np.mean(np.minimum(near.min(0), CAP)))
+    return float(np.mean(np.minimum(near.min(0), frame_fit.CAP)))
 
 
 def _path(table: Array, gate: float) -> Rows:
@@ -203,7 +196,7 @@ def _pairing(
     return Pairing(
         rows=kept, shifts=shifts, swapped=swapped, strays=tuple(strays),
         elsewhere=tuple(elsewhere),
-        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle),
+        fit=frame_fit.fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle),
     )  # fmt: skip
 
 
@@ -240,9 +233,9 @@ def find_move(A: Array, C: Array, middle: Array) -> Moved | None:
     for part in (slice(half), slice(half, None)):
         if half < MIN_STRETCH:
             return None
-        seed = fit_frames(A[part], C[part], middle)
-        errors = np.minimum(np.diag(mismatch(seed, A, C)), CAP)
-        before, after = errors, CAP - errors
+        seed = frame_fit.fit_frames(A[part], C[part], middle)
+        errors = np.minimum(np.diag(frame_fit.mismatch(seed, A, C)), frame_fit.CAP)
+        before, after = errors, frame_fit.CAP - errors
         if part.start is not None:
             before, after = after, before
         cost = np.cumsum(np.append(0, before)) + np.cumsum(np.append(0, after[::-1]))[::-1]
@@ -270,7 +263,7 @@ def _likeliest(found: list[Moved]) -> Moved | None:
 
 def _moves_at(A: Array, C: Array, middle: Array, start: int) -> Iterator[Moved]:
     """Yield both kinds of move at a row, each with the score of a model that shares the rest."""
-    halves = [fit_frames(A[s], C[s], middle) for s in (slice(start), slice(start, None))]
+    halves = [frame_fit.fit_frames(A[s], C[s], middle) for s in (slice(start), slice(start, None))]
     for frame in MOVED_FRAMES:
         for fit in halves:
             step, best = _carried(A, C, middle, start, frame, fit)
@@ -278,8 +271,8 @@ def _moves_at(A: Array, C: Array, middle: Array, start: int) -> Iterator[Moved]:
 
 
 def _carried(
-    A: Array, C: Array, middle: Array, start: int, frame: MovedFrame, fit: FrameFit,
-    ) -> tuple[Array, FrameFit]:  # fmt: skip
+    A: Array, C: Array, middle: Array, start: int, frame: MovedFrame, fit: frame_fit.FrameFit,
+    ) -> tuple[Array, frame_fit.FrameFit]:  # fmt: skip
     """Return the move of a frame at a row, and the fit of all views with the move taken back.
 
     Every view shows where the frame stands, given the other one: X_i = A_i^-1 Z C_i^-1 or
@@ -291,7 +284,9 @@ def _carried(
         seen[:, :3, 3] *= fit.length_ratio
         hand = frame == "X"
         places = se3.invert(A) @ fit.Z @ se3.invert(seen) if hand else A @ fit.X @ seen
-        step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
+        step = frame_fit.mean_transform(places[:start]) @ se3.invert(
+            frame_fit.mean_transform(places[start:])
+        )
         later = A[start:] @ se3.invert(step) if hand else step @ A[start:]
-        fit = fit_frames(np.concatenate([A[:start], later]), C, middle)
+        fit = frame_fit.fit_frames(np.concatenate([A[:start], later]), C, middle)
     return step, fit

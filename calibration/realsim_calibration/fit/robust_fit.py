@@ -18,6 +18,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
+from realsim_calibration.fit import noise_scale
 from realsim_calibration.fit.board_pose import refine_board_pose
 from realsim_calibration.fit.effective import PlainFit, plain_fits, projection, stretch
 from realsim_calibration.fit.joint_solve import (
@@ -28,15 +29,6 @@ from realsim_calibration.fit.joint_solve import (
     smooth_errors,
 )
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
-from realsim_calibration.fit.noise_scale import (
-    Whiteness,
-    estimate_arm,
-    estimate_ratio,
-    estimate_scale,
-    largest_ratio,
-    unknown_arm_columns,
-    whiteness,
-)
 from realsim_calibration.fit.robot_error import (
     ErrorBasis,
     arm_basis,
@@ -152,7 +144,7 @@ def solve(
         # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
         noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
         basis = arm_basis(arm, joints, Ts)
-        arm_ratio, known = estimate_arm(model, basis, sigma, noise)
+        arm_ratio, known = noise_scale.estimate_arm(model, basis, sigma, noise)
         fit = model.fit(known, arm_ratio, sigma)
         if config.robot_map:
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
@@ -160,7 +152,7 @@ def solve(
     if best.basis is not None and best.basis.kind != "arm":
         basis = _mean_strength(best.basis, choices)
         if not fixed:
-            ratio = estimate_ratio(model, basis, sigma, most, config.noise)
+            ratio = noise_scale.estimate_ratio(model, basis, sigma, most, config.noise)
         used = ratio if not fixed else best.ratio
         best = Choice(basis=basis, ratio=used, fit=model.fit(basis, used, sigma))
     alone = state.moved(none.fit.step)
@@ -219,18 +211,18 @@ def _first_fit(
 def _robot_share(
     problem: JointProblem, model: LinearModel, state: JointState, sigma: float,
     config: "HandEyeConfig",
-) -> tuple[Whiteness, float, Array]:  # fmt: skip
+) -> tuple[noise_scale.Whiteness, float, Array]:  # fmt: skip
     """Return whether corners are independent, the largest lambda, and lambda (2,) without a map."""
     noise = config.noise
     if config.joint.robot_ratio:
-        white = whiteness(problem, state, noise)
+        white = noise_scale.whiteness(problem, state, noise)
         return white, config.joint.robot_ratio, np.full(2, config.joint.robot_ratio)
-    free = estimate_ratio(model, None, sigma, noise.most, noise)
+    free = noise_scale.estimate_ratio(model, None, sigma, noise.most, noise)
     # Judged where the lens is fitted with the robot's share as it would like to be.
-    white = whiteness(problem, state.moved(model.fit(None, free, sigma).step), noise)
-    most = largest_ratio(white, noise)
+    white = noise_scale.whiteness(problem, state.moved(model.fit(None, free, sigma).step), noise)
+    most = noise_scale.largest_ratio(white, noise)
     if most < noise.most:
-        free = estimate_ratio(model, None, sigma, most, noise)
+        free = noise_scale.estimate_ratio(model, None, sigma, most, noise)
     return white, most, free
 
 
@@ -300,12 +292,12 @@ def hidden_errors(
     """Return errors (views, 6, q) that the arm may have, per standard deviation."""
     if known is not None:
         return known.columns
-    scaled = estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
+    scaled = noise_scale.estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
     fit = model.fit(scaled, none.ratio, sigma)
     spread = np.asarray(
         np.linalg.inv(fit.information)[model.shared :, model.shared :], dtype=np.float64
     )
-    return unknown_arm_columns(scaled, fit.step[model.shared :], spread)
+    return noise_scale.unknown_arm_columns(scaled, fit.step[model.shared :], spread)
 
 
 def _covariance(

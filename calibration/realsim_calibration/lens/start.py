@@ -19,15 +19,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim_calibration.detect.homography import fit_homography
 from realsim_calibration.fit.view_system import camera_record
-from realsim_calibration.lens.bundle import (
-    BOARD_TERMS,
-    CAMERA_TERMS,
-    NEAREST_M,
-    Observations,
-    State,
-    points_in_camera,
-    refine_poses,
-)
+from realsim_calibration.lens import bundle
 
 FAN = np.geomspace(0.3, 8.0, 18)
 """Focal lengths that are tried, in longer image sides: from 118 deg of field of view to 7 deg."""
@@ -76,20 +68,20 @@ def pose_of_homography(H: Array) -> Array:
     return se3.from_rt(R * flip[..., None, None], H[..., 2])
 
 
-def _homographies(obs: Observations, image: Array) -> Array:
+def _homographies(obs: bundle.Observations, image: Array) -> Array:
     cuts = list(zip(obs.offsets[:-1], obs.offsets[1:], strict=True))
     return np.stack([fit_homography(obs.flat[a:b], image[a:b]) for a, b in cuts])
 
 
-def view_errors(state: State, obs: Observations) -> Array:
+def view_errors(state: bundle.State, obs: bundle.Observations) -> Array:
     """Return the median distance of every view's corners from where they are expected [px].
 
     (views,), infinite where a corner is behind the camera.
     """
     from realsim.geometry.camera import project
 
-    cam = points_in_camera(state, obs)
-    cam[cam[:, 2] < NEAREST_M] = np.nan
+    cam = bundle.points_in_camera(state, obs)
+    cam[cam[:, 2] < bundle.NEAREST_M] = np.nan
     error = np.linalg.norm(
         project(camera_record(state.camera, obs.image_size), cam) - obs.uv, axis=-1
     )
@@ -99,7 +91,7 @@ def view_errors(state: State, obs: Observations) -> Array:
                      float(np.median(error[a:b])) for a, b in cuts])  # fmt: skip
 
 
-def start_state(obs: Observations, camera: Array | None) -> tuple[State, str]:
+def start_state(obs: bundle.Observations, camera: Array | None) -> tuple[bundle.State, str]:
     """Return a first state, and how its focal length was found.
 
     Args:
@@ -107,12 +99,12 @@ def start_state(obs: Observations, camera: Array | None) -> tuple[State, str]:
         camera: (12,) known camera, or None.
     """
     width, height = obs.image_size
-    board = np.zeros(BOARD_TERMS)
+    board = np.zeros(bundle.BOARD_TERMS)
     if camera is not None:
         xy, valid = undistort(camera_record(camera, obs.image_size), obs.uv)
         ideal = (obs.uv - camera[2:4]) / camera[:2]
         H = _homographies(obs, np.where(valid[:, None], xy, ideal))
-        return State(camera=camera, board=board, poses=pose_of_homography(H)), "given"
+        return bundle.State(camera=camera, board=board, poses=pose_of_homography(H)), "given"
     H = _homographies(obs, obs.uv)
     closed = zhang_focal(H, obs.image_size)
     tries = [(float(f * max(obs.image_size)), "fan") for f in FAN]
@@ -120,12 +112,12 @@ def start_state(obs: Observations, camera: Array | None) -> tuple[State, str]:
         tries.append((closed, "Zhang"))
     best, least = None, np.inf
     for focal, name in tries:
-        vector = np.zeros(CAMERA_TERMS)
+        vector = np.zeros(bundle.CAMERA_TERMS)
         vector[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
         inverse = np.linalg.inv(camera_record(vector, obs.image_size).K)
         ideal = np.asarray(inverse @ H, dtype=np.float64)
         poses = pose_of_homography(ideal)
-        state = State(camera=vector, board=board, poses=poses)
+        state = bundle.State(camera=vector, board=board, poses=poses)
         error = float(np.median(view_errors(state, obs)))
         if best is None or error < least:
             best, least = (state, name), error
@@ -152,13 +144,13 @@ def mirror_poses(poses: Array) -> Array:
     return mirrored
 
 
-def choose_twins(state: State, obs: Observations, sigma_px: float) -> State:
+def choose_twins(state: bundle.State, obs: bundle.Observations, sigma_px: float) -> bundle.State:
     """Return the state with every pose replaced by its mirror twin where that fits better.
 
     The state's own poses should be fitted already.
     """
-    state, costs = refine_poses(state, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
+    state, costs = bundle.refine_poses(state, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
     twin = replace(state, poses=mirror_poses(state.poses))
-    twin, twin_costs = refine_poses(twin, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
+    twin, twin_costs = bundle.refine_poses(twin, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
     better = twin_costs < costs
     return replace(state, poses=np.where(better[:, None, None], twin.poses, state.poses))

@@ -13,20 +13,11 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.bags import realsense as rs
+from realsim.formats.bags import wire
 from realsim.formats.bags.joints import JointTrack
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import TfTree
 from realsim.formats.bags.topics import BagChoice, ImageTopic, Topics
-from realsim.formats.bags.wire import (
-    NS_PER_S,
-    ImageMessage,
-    MessageError,
-    body_of,
-    header_of,
-    image_of,
-    joints_of,
-    transforms_of,
-)
 
 STAMPS_LOOKED_AT = 3
 """A topic whose first stamps are all zero has a sender that never set them."""
@@ -112,9 +103,9 @@ def scan(recording: Recording, topics: Topics, choice: BagChoice) -> Scan:
     for topic, receive_ns, data in recording.messages(list(handlers)):
         try:
             handlers[topic](receive_ns, data)
-        except MessageError as error:
+        except wire.MessageError as error:
             raise InputError(
-                f"{recording.path.name}, {topic} at {receive_ns / NS_PER_S:.6f} s: {error}."
+                f"{recording.path.name}, {topic} at {receive_ns / wire.NS_PER_S:.6f} s: {error}."
             ) from error
     for image in images:
         notes += image.finish(by_receive)
@@ -146,7 +137,7 @@ def _handlers(
 
     def image_handler(times: ImageTimes) -> Callable[[int, bytes], None]:
         def handle(receive_ns: int, data: bytes) -> None:
-            times.stamps.append(header_of(data, is_ros2).stamp_ns)
+            times.stamps.append(wire.header_of(data, is_ros2).stamp_ns)
             times.receives.append(receive_ns)
 
         return handle
@@ -156,14 +147,14 @@ def _handlers(
 
     def tf_handler(static: bool) -> Callable[[int, bytes], None]:
         def handle(receive_ns: int, data: bytes) -> None:
-            for t in transforms_of(data, is_ros2):
+            for t in wire.transforms_of(data, is_ros2):
                 if static or by_receive or t.stamp_ns:
                     tree.add(t, receive_ns if by_receive else t.stamp_ns, static)
 
         return handle
 
     def joint_handler(receive_ns: int, data: bytes) -> None:
-        message = joints_of(data, is_ros2)
+        message = wire.joints_of(data, is_ros2)
         if track is not None and (by_receive or message.stamp_ns):
             track.add(message, receive_ns if by_receive else message.stamp_ns)
 
@@ -188,12 +179,12 @@ def _same_camera(topic: str, is_ros2: bool) -> Callable[[int, bytes], None]:
     first: list[bytes] = []
 
     def handle(receive_ns: int, data: bytes) -> None:
-        body = body_of(data, is_ros2)
+        body = wire.body_of(data, is_ros2)
         if not first:
             first.append(body)
         elif body != first[0]:
             raise InputError(
-                f"{topic} changes during the recording (at {receive_ns / NS_PER_S:.6f} s): a "
+                f"{topic} changes during the recording (at {receive_ns / wire.NS_PER_S:.6f} s): a "
                 "session has one camera. Was it switched to another mode or calibrated? Give the "
                 "camera in a file (intrinsics=), or cut the recording."
             )
@@ -210,7 +201,7 @@ def _unset_stamps(recording: Recording, topics: Topics) -> list[str]:
     for name in names:
         stamps: list[int] = []
         for _, _, data in recording.messages([name]):
-            stamps.append(header_of(data, recording.is_ros2).stamp_ns)
+            stamps.append(wire.header_of(data, recording.is_ros2).stamp_ns)
             if len(stamps) >= STAMPS_LOOKED_AT:
                 break
         if stamps and not any(stamps):
@@ -273,7 +264,7 @@ class Messages:
         self._recording = recording
         self._streams = list(streams)
 
-    def read(self, start: int) -> Iterator[tuple[int, list[ImageMessage]]]:
+    def read(self, start: int) -> Iterator[tuple[int, list[wire.ImageMessage]]]:
         """Yield (number, an image of every stream) of the frames from `start` on.
 
         Raises:
@@ -290,7 +281,7 @@ class Messages:
         first_ns = min(int(s.receive_ns[start:].min()) for s in self._streams)
         topics = {s.topic for s in self._streams}
         for topic, receive_ns, data in self._recording.messages(topics, start_ns=first_ns):
-            key = (topic, receive_ns, header_of(data, self._recording.is_ros2).stamp_ns)
+            key = (topic, receive_ns, wire.header_of(data, self._recording.is_ros2).stamp_ns)
             if key not in owner or key in pending:
                 continue
             pending[key] = data
@@ -313,7 +304,7 @@ class Messages:
         if following < end:
             raise self._lost("an", self._streams[0].key(following))
 
-    def one(self, stream: int, n: int) -> ImageMessage:
+    def one(self, stream: int, n: int) -> wire.ImageMessage:
         """Return the image of frame n of a stream, fetched on its own.
 
         Raises:
@@ -322,7 +313,7 @@ class Messages:
         key = topic, receive_ns, header_ns = self._streams[stream].key(n)
         is_ros2 = self._recording.is_ros2
         for _, _, data in self._recording.messages([topic], receive_ns, receive_ns + 1):
-            if header_of(data, is_ros2).stamp_ns == header_ns:
+            if wire.header_of(data, is_ros2).stamp_ns == header_ns:
                 return self._image(stream, data)
         raise self._lost("the", key)
 
@@ -330,12 +321,12 @@ class Messages:
         topic, receive_ns, _ = key
         return InputError(
             f"{self._recording.path}: {article} image of {topic} recorded at "
-            f"{receive_ns / NS_PER_S:.6f} s is not there any more. Was the file changed?"
+            f"{receive_ns / wire.NS_PER_S:.6f} s is not there any more. Was the file changed?"
         )
 
-    def _image(self, stream: int, data: bytes) -> ImageMessage:
+    def _image(self, stream: int, data: bytes) -> wire.ImageMessage:
         s = self._streams[stream]
         try:
-            return image_of(data, self._recording.is_ros2, s.compressed)
-        except MessageError as error:
+            return wire.image_of(data, self._recording.is_ros2, s.compressed)
+        except wire.MessageError as error:
             raise InputError(f"{self._recording.path.name}, {s.topic}: {error}.") from error

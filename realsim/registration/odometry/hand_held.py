@@ -19,18 +19,7 @@ from realsim.geometry.clouds import plane_frame
 from realsim.interop import T_from_pose3, pose3_from_T
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, check_frames, measure_noise
-from realsim.registration.odometry.pairs import (
-    LEAST_POINTS,
-    LEAST_SHARE,
-    Edge,
-    FitConfig,
-    PairConfig,
-    PairMeter,
-    ViewCloud,
-    relative,
-    view_angles,
-    view_cloud,
-)
+from realsim.registration.odometry import pairs
 from realsim.registration.views import SampleConfig, sample_view
 
 FREE = 1.0
@@ -52,7 +41,7 @@ CAUCHY = 2.0
 """Whitened length from which a pair counts less: a wrong loop must not bend the path."""
 INFLATION = 2.0
 """Sigmas are enlarged by this: pairs of one view share its depth errors."""
-PAIRS = PairConfig(fit=FitConfig(convergence=1e-5, max_iterations=300))
+PAIRS = pairs.PairConfig(fit=pairs.FitConfig(convergence=1e-5, max_iterations=300))
 """Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
 KEY_DEG = 16.0
 """A view this far from the last key view becomes one [deg]; drift grows with their number, and
@@ -86,7 +75,7 @@ class Graph:
 
 
 def optimise_poses(
-    Ts_world_cam: Array, edges: Sequence[Edge], levelled: Sequence[bool], angles: Array
+    Ts_world_cam: Array, edges: Sequence[pairs.Edge], levelled: Sequence[bool], angles: Array
 ) -> Graph:
     """Return the poses that fit all pairs and the table best, with their covariances.
 
@@ -190,9 +179,9 @@ def hand_held_poses(
         [se3.transform(T, c.source).mean(0) for T, c in zip(Ts, clouds, strict=True)], 0
     )
     levelled = tuple(c.normal is not None for c in clouds)
-    angles = view_angles(Ts, aim, PAIRS.zoom_deg)
+    angles = pairs.view_angles(Ts, aim, PAIRS.zoom_deg)
     Ts = optimise_poses(Ts, path.edges, levelled, angles).Ts_world_cam
-    loops = _loops(path, Ts, view_angles(Ts, aim, PAIRS.zoom_deg))
+    loops = _loops(path, Ts, pairs.view_angles(Ts, aim, PAIRS.zoom_deg))
     graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles)
     r = graph.residuals if len(graph.residuals) else np.zeros((1, 6))
     return HandHeld(
@@ -208,7 +197,7 @@ def hand_held_poses(
 
 def _clouds(
     intrinsics: CameraIntrinsics, depths: Sequence[Array32], sample: SampleConfig
-) -> list[ViewCloud]:
+) -> list[pairs.ViewCloud]:
     """Return every view split into its table and what stands on it."""
     frames = check_frames(
         [DepthFrame(index=k, depth_m=d, T_world_cam=np.eye(4)) for k, d in enumerate(depths)],
@@ -216,20 +205,20 @@ def _clouds(
     )
     noise = measure_noise(frames, EvidenceConfig())
     rng = np.random.default_rng(SEED)
-    clouds: list[ViewCloud] = []
+    clouds: list[pairs.ViewCloud] = []
     for frame in frames:
         points = sample_view(intrinsics, frame, noise, sample)
-        cloud = view_cloud(points, None, rng)
+        cloud = pairs.view_cloud(points, None, rng)
         if frame.index == 0 and cloud.normal is None:
             raise DegenerateError(
                 "view 0 sees no table: no plane carries at least "
-                f"{100 * LEAST_SHARE:.0f} % of its points. The first view of a "
+                f"{100 * pairs.LEAST_SHARE:.0f} % of its points. The first view of a "
                 "hand-held capture has to show the table; look down on it from 30 to 50 cm."
             )
-        if cloud.normal is not None and len(cloud.source) < LEAST_POINTS:
+        if cloud.normal is not None and len(cloud.source) < pairs.LEAST_POINTS:
             raise InputError(
                 f"view {frame.index} holds only {len(cloud.source)} averaged points above the "
-                f"table; at least {LEAST_POINTS} are needed. Leave the view out, or "
+                f"table; at least {pairs.LEAST_POINTS} are needed. Leave the view out, or "
                 "keep the things on the table in the picture."
             )
         clouds.append(cloud)
@@ -239,16 +228,16 @@ def _clouds(
 class _Path:
     """The views one after the other, each placed by the key view before it."""
 
-    def __init__(self, clouds: Sequence[ViewCloud]) -> None:
+    def __init__(self, clouds: Sequence[pairs.ViewCloud]) -> None:
         """Begin with the first view, over the table."""
         self.clouds = list(clouds)
-        self.meter = PairMeter(self.clouds, PAIRS)
+        self.meter = pairs.PairMeter(self.clouds, PAIRS)
         first = self.clouds[0]
         assert first.normal is not None  # checked when the clouds were made
         T_cam_table = plane_frame(first.normal, first.offset, first.target)
         self.poses = [se3.invert(T_cam_table)]
         self.keys = [0]
-        self.edges: list[Edge] = []
+        self.edges: list[pairs.Edge] = []
         self.overlaps = [1.0]
 
     def add(self, k: int) -> None:
@@ -277,11 +266,11 @@ class _Path:
             edge = self._try(k, j, T)
             if edge.overlap >= LEAST_OVERLAP:
                 self.edges.append(edge)
-        turned = np.degrees(se3.angle(relative(np.stack(self.poses), self.keys[-1], k)))
+        turned = np.degrees(se3.angle(pairs.relative(np.stack(self.poses), self.keys[-1], k)))
         if turned > KEY_DEG or best.overlap < KEY_OVERLAP:
             self.keys.append(k)
 
-    def _try(self, k: int, reference: int, T_world_cam: Array) -> Edge:
+    def _try(self, k: int, reference: int, T_world_cam: Array) -> pairs.Edge:
         """Return view k measured against a view that is placed, from a guess of its pose."""
         return self.meter.measure(reference, k, se3.invert(self.poses[reference]) @ T_world_cam)
 
@@ -302,10 +291,10 @@ class _Path:
             self.clouds[k] = replace(self.clouds[k], normal=None)
 
 
-def _loops(path: _Path, Ts: Array, angles: Array) -> list[Edge]:
+def _loops(path: _Path, Ts: Array, angles: Array) -> list[pairs.Edge]:
     """Return pairs of key views that see the same but do not follow each other."""
     known = {(e.first, e.second) for e in path.edges}
-    found: list[Edge] = []
+    found: list[pairs.Edge] = []
     for place, k in enumerate(path.keys):
         earlier = np.array(path.keys[: max(place - 1, 0)], dtype=np.int64)
         near = earlier[np.argsort(angles[k, earlier], kind="stable")] if len(earlier) else earlier
@@ -316,7 +305,7 @@ def _loops(path: _Path, Ts: Array, angles: Array) -> list[Edge]:
             if (j, k) in known:
                 continue
             tried += 1
-            edge = path.meter.measure(j, k, relative(Ts, j, k))
+            edge = path.meter.measure(j, k, pairs.relative(Ts, j, k))
             if edge.overlap >= LEAST_OVERLAP:
                 found.append(edge)
     return found

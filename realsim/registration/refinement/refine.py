@@ -31,6 +31,7 @@ from realsim.geometry.seen_surface import seen_distances
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
+from realsim.registration.refinement import priors
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.equations import (
     BLOCK,
@@ -54,14 +55,6 @@ from realsim.registration.refinement.points import (
     exact_residuals,
     join_views,
     thin_share,
-)
-from realsim.registration.refinement.priors import (
-    OF_FIXED,
-    OF_VIEW,
-    add_priors,
-    learn_sigmas,
-    said_sigmas,
-    view_precisions,
 )
 from realsim.registration.views import ViewPoints
 
@@ -174,7 +167,7 @@ def refine(
         np.array([v.fixed is None for v in views]), config,
         [thin_share(b, config.thin_cells) > config.thin_share for b in bodies],
     )  # fmt: skip
-    of_view = OF_VIEW if np.all(task.hand) else OF_FIXED
+    of_view = priors.OF_VIEW if np.all(task.hand) else priors.OF_FIXED
     state = State(
         poses=np.stack(poses) if len(poses) else np.zeros((0, 4, 4)),
         T_world_table=None if plane is None else plane.T_world_table.copy(),
@@ -183,7 +176,7 @@ def refine(
         common=None if np.all(task.hand) else task.hand.astype(np.float64),
     )  # fmt: skip
     misfits = np.full(len(bodies) + 1, WIDEST_M)
-    sigmas = said_sigmas(config)
+    sigmas = priors.said_sigmas(config)
     history: list[dict[str, float]] = []
     system, blocks, used = None, list[Blocks](), np.zeros(len(bodies) + 1)
     for round_ in range(config.rounds):
@@ -203,12 +196,12 @@ def refine(
         for _ in range(config.steps):
             blocks, misfits, used = _linearise(task, state, (own, table), misfits, exact)
             system = assemble(blocks, OBJECTS + 6 * len(own), of_view)
-            add_priors(system, state, task.views, config, sigmas)
+            priors.add_priors(system, state, task.views, config, sigmas)
             blur = config.blur_m[min(round_, len(config.blur_m) - 1)]
             for k, points in zip(flat, near, strict=True):
                 _add_step(system, task, state, k, points, blur)
             state = step_state(state, task.bodies, *solve(system))
-            sigmas = learn_sigmas(system, state, task.hand, config, sigmas)
+            sigmas = priors.learn_sigmas(system, state, task.hand, config, sigmas)
         history.append(_row(state, misfits, sigmas))
         if progress is not None:
             progress(round_ + 1, config.rounds)
@@ -369,7 +362,7 @@ def _apart(
     1982), each solved from the same equations.
     """
     A, a = without_views(system)
-    W = view_precisions(task.views, sigmas, task.config)
+    W = priors.view_precisions(task.views, sigmas, task.config)
     largest = np.zeros_like(A)
     # Cameras that stand still are no neighbours of any, and each has its own prior.
     hand = np.flatnonzero(task.hand)

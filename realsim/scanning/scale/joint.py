@@ -16,15 +16,8 @@ from realsim.arrays import Array, Int32
 from realsim.geometry.normal_equations import System, inverse, view_steps
 from realsim.records import Mesh
 from realsim.registration.refinement.equations import BIAS_AT, HAND_EYE_AT, TABLE_AT
+from realsim.scanning.scale import equations
 from realsim.scanning.scale.config import ScaleConfig
-from realsim.scanning.scale.equations import (
-    Reduced,
-    Round,
-    linearised,
-    new_round,
-    object_distances,
-    reduced,
-)
 from realsim.scanning.scale.evidence import ScanEvidence
 from realsim.scanning.scale.shape import (
     INNER_EXTENT,
@@ -95,16 +88,18 @@ def joint_fit(
     width = FIRST_SHAPE * size
     models: list[ShapeModel] = []
     history: list[dict[str, float]] = []
-    held: Round | None = None
+    held: equations.Round | None = None
     for cut in CUTS:
         within = 0.0
         if models:
             inner = within_share(shape.patches, models[0].length_m / state.s)
             within = models[0].sigma_m * inner
-        held = new_round(shape, evidence, state, within, config)
+        held = equations.new_round(shape, evidence, state, within, config)
         for step in range(STEPS):
-            system, *_ = linearised(shape, evidence, state, held, (offsets, cut, width), config)
-            shared = reduced(system)
+            system, *_ = equations.linearised(
+                shape, evidence, state, held, (offsets, cut, width), config
+            )
+            shared = equations.reduced(system)
             information, offered = shared.of_offsets()
             if step == 0 or not models:
                 models = shape_models(
@@ -120,14 +115,14 @@ def joint_fit(
             "outline_points": float(sum(len(r) for r in held.rims.points)),
         })  # fmt: skip
     assert held is not None, "there is at least one round"
-    system, residuals, kernels = linearised(
+    system, residuals, kernels = equations.linearised(
         shape, evidence, state, held, (offsets, CUTS[-1], width), config
     )
     look, (mean, offsets) = _outlook(shape, evidence, state, (system, residuals, kernels), config)
     # The mean over all assumptions about the shape, of which the last step took the best.
     state = _moved(state, system, mean, offsets)
     cameras = state.cameras(claimed_cameras(evidence.views))
-    (places, *_), _ = object_distances(shape, state, cameras, held.points, held.views)
+    (places, *_), _ = equations.object_distances(shape, state, cameras, held.points, held.views)
     local = places / state.s
     return state, replace(look, history=tuple(history), local=local, view_of=held.views)
 
@@ -147,7 +142,7 @@ def _outlook(
 ) -> tuple[Outlook, tuple[Array, Array]]:
     """Return what was seen, and step and offsets in the mean over all assumptions."""
     system, residuals, kernels = last
-    shared = reduced(system)
+    shared = equations.reduced(system)
     information, offered = shared.of_offsets()
     models = shape_models(
         shape.patches, information, offered, (state.s, evidence.size_m), config.shape
@@ -177,10 +172,10 @@ def _outlook(
 def _without(system: System, shape_covariance: Array) -> dict[str, float]:
     """Return the variance of the log scale if each source of error were known exactly."""
 
-    def covariance(shared: Reduced) -> Array:
+    def covariance(shared: equations.Reduced) -> Array:
         return shared.covariance(posterior(*shared.of_offsets(), shape_covariance)[1])
 
-    shared, held = reduced(system), Reduced(system.A, system.a)
+    shared, held = equations.reduced(system), equations.Reduced(system.A, system.a)
     alone = system.A[np.ix_(SIMILARITY, SIMILARITY)]
     out = {
         "shape": float(inverse(shared.A[:PATCHES, :PATCHES])[SIZE, SIZE]),

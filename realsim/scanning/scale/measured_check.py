@@ -9,16 +9,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.scanning.scale.measured import (
-    AGREE_Z,
-    KINDS,
-    MEANING,
-    Measurement,
-    contradiction,
-    scale_of,
-    typo,
-    weighted,
-)
+from realsim.scanning.scale import measured
 from realsim.scanning.scale.result import ScaleFit
 
 LOG_SCALE = 6
@@ -31,7 +22,7 @@ TO_SIGMA = 1.4826
 class MeasuredCheck:
     """One measured length against a fit."""
 
-    measurement: Measurement
+    measurement: measured.Measurement
     length: float
     """The same length on the mesh [units of the mesh]."""
     scale: float
@@ -66,7 +57,7 @@ def shape_error_m(fit: ScaleFit) -> float:
     return 1e-3 * TO_SIGMA * float(np.median(np.abs(seen - np.median(seen))))
 
 
-def compare(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> MeasuredCheck:
+def compare(fit: ScaleFit, mesh: Mesh, measurement: measured.Measurement) -> MeasuredCheck:
     """Return whether a measured length agrees with a fit.
 
     Args:
@@ -74,18 +65,18 @@ def compare(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> MeasuredChec
         mesh: the mesh it is of, in its own unit.
         measurement: what was measured. A 'height' is out of the table, as the object stands.
     """
-    alone = scale_of(mesh, measurement, as_it_stands(fit), shape_error_m(fit))
+    alone = measured.scale_of(mesh, measurement, as_it_stands(fit), shape_error_m(fit))
     ratio = alone.scale / fit.scale
     z = (alone.scale - fit.scale) / float(np.hypot(alone.sigma, fit.sigma))
     fitted_mm, percent = 1e3 * alone.length * fit.scale, 100 * (ratio - 1)
-    agrees = abs(z) <= AGREE_Z
+    agrees = abs(z) <= measured.AGREE_Z
     said = f"measured {1e3 * measurement.value_m:.4g} mm, fitted {fitted_mm:.4g} mm"
     how = f"{percent:+.2f} %, {abs(z):.1f} sigma" if abs(percent) < 100 else f"{ratio:.3g} times"
     text = f"{measurement.kind}: {said} ({how})"
     if agrees:
         text += ": they agree."
     else:
-        hint = typo(ratio) or _other_kind(fit, mesh, measurement)
+        hint = measured.typo(ratio) or _other_kind(fit, mesh, measurement)
         text += f": they do not agree.{' ' + hint[0].upper() + hint[1:] if hint else ''}"
     return MeasuredCheck(
         measurement=measurement, length=alone.length, scale=alone.scale, sigma=alone.sigma,
@@ -93,25 +84,25 @@ def compare(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> MeasuredChec
     )  # fmt: skip
 
 
-def _other_kind(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> str:
+def _other_kind(fit: ScaleFit, mesh: Mesh, measurement: measured.Measurement) -> str:
     """Return which other length of the mesh the measured one would fit, '' for none."""
     fitting: list[str] = []
-    for kind in KINDS:
+    for kind in measured.KINDS:
         if kind in ("between", measurement.kind):
             continue
         other = replace(measurement, kind=kind, points=None)
         try:
-            alone = scale_of(mesh, other, as_it_stands(fit), shape_error_m(fit))
+            alone = measured.scale_of(mesh, other, as_it_stands(fit), shape_error_m(fit))
         except DegenerateError:  # flat along that axis: it was not measured there
             continue
         z = (alone.scale - fit.scale) / float(np.hypot(alone.sigma, fit.sigma))
-        if abs(z) <= AGREE_Z:
-            fitting.append(f"'{kind}' ({MEANING[kind]})")
+        if abs(z) <= measured.AGREE_Z:
+            fitting.append(f"'{kind}' ({measured.MEANING[kind]})")
     return f"it would agree as {' or '.join(fitting)}." if fitting else ""
 
 
 def with_measurements(
-    fit: ScaleFit, mesh: Mesh, measurements: Sequence[Measurement]
+    fit: ScaleFit, mesh: Mesh, measurements: Sequence[measured.Measurement]
 ) -> tuple[ScaleFit, tuple[MeasuredCheck, ...]]:
     """Return the fit with measured lengths taken in, and how each compares with the fit alone.
 
@@ -122,14 +113,16 @@ def with_measurements(
         return fit, ()
     checks = tuple(compare(fit, mesh, m) for m in measurements)
     R_up, shape_m = as_it_stands(fit), shape_error_m(fit)
-    each = [scale_of(mesh, m, R_up) for m in measurements]
-    between = contradiction([scale_of(mesh, m, R_up, shape_m) for m in measurements])
+    each = [measured.scale_of(mesh, m, R_up) for m in measurements]
+    between = measured.contradiction(
+        [measured.scale_of(mesh, m, R_up, shape_m) for m in measurements]
+    )
     faults = [*(c.text for c in checks if not c.agrees), *([between] if between else [])]
     if faults:
         verdict = "doubtful" if fit.verdict == "accepted" else fit.verdict
         return replace(fit, verdict=verdict, reasons=(*fit.reasons, *faults)), checks
     # The mesh's shape error is the same in every length; it is not averaged away by more of them.
-    scale, sigma = weighted([e.scale for e in each], [e.sigma for e in each])
+    scale, sigma = measured.weighted([e.scale for e in each], [e.sigma for e in each])
     shape = shape_m * np.sqrt(2) / max(e.length for e in each)
     joined = conditioned(fit, mesh, scale, float(np.hypot(sigma, shape)))
     note = (

@@ -11,18 +11,11 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
+from realsim.scanning.sfm import mapping
 from realsim.scanning.sfm.alignment import align_to_robot, tested_freely, tested_refined
 from realsim.scanning.sfm.bundle import Bundle, adjust, halves, prior_sigmas, reliability
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.database import MatchDatabase
-from realsim.scanning.sfm.mapping import (
-    geometry_of,
-    map_freely,
-    model_at_poses,
-    scaled,
-    set_geometry,
-    triangulated,
-)
 from realsim.scanning.sfm.photographs import Photographs
 from realsim.scanning.sfm.result import Alignment, Poses, Progress
 
@@ -70,12 +63,12 @@ class Job:
 
 def map_free(job: Job, database: MatchDatabase) -> Mapped:
     """Map without poses, then bring the model to the robot's world."""
-    models = map_freely(
+    models = mapping.map_freely(
         database, job.config, refine_camera=job.intrinsics is None, folder=job.folder / WORK,
         tick=job.tick("mapping"),
     )  # fmt: skip
     model, sizes = models[0], tuple(int(m.num_reg_images()) for m in models)
-    found = geometry_of(model, job.folder / MODEL)
+    found = mapping.geometry_of(model, job.folder / MODEL)
     posed = [k for k, n in enumerate(found.names) if n in job.robot]
     if not job.robot:
         return Mapped(
@@ -87,8 +80,8 @@ def map_free(job: Job, database: MatchDatabase) -> Mapped:
         names, found.Ts_world_cam[posed], np.array([job.robot[n] for n in names]).reshape(-1, 4, 4),
         job.config.alignment, np.random.default_rng(job.config.seed),
     )  # fmt: skip
-    scaled(model, alignment.scale, alignment.R, alignment.t)
-    metric = geometry_of(model, job.folder / MODEL)
+    mapping.scaled(model, alignment.scale, alignment.R, alignment.t)
+    metric = mapping.geometry_of(model, job.folder / MODEL)
     alignment, own = tested_freely(
         alignment, metric, job.robot, job.config.alignment, job.config.mapping
     )
@@ -102,7 +95,7 @@ def map_free(job: Job, database: MatchDatabase) -> Mapped:
 def map_at_poses(job: Job, database: MatchDatabase, Ts: Array, poses: Poses) -> Mapped:
     """Triangulate at the robot's poses; where asked for, refine both."""
     m, limit = job.config.mapping, job.config.mapping.known_error_px
-    model = _with_points(job, database, model_at_poses(database, Ts), limit)
+    model = _with_points(job, database, mapping.model_at_poses(database, Ts), limit)
     if poses == "known":
         job.progress("mapping", 1, 1)
         _drop_far(model, limit, m.min_angle_deg)
@@ -111,7 +104,7 @@ def map_at_poses(job: Job, database: MatchDatabase, Ts: Array, poses: Poses) -> 
     found = bundle.geometry
     alignment, share = _compared(job, bundle, robot)
     if share < m.least_reliability:
-        model = _with_points(job, database, model_at_poses(database, Ts), m.reprojection_px)
+        model = _with_points(job, database, mapping.model_at_poses(database, Ts), m.reprojection_px)
         known = _known(job, model, Ts)
         return replace(known, alignment=alignment, reliability=share)
     _drop_far(model, m.reprojection_px, m.min_angle_deg)
@@ -134,10 +127,10 @@ def _refined(job: Job, database: MatchDatabase, model: Any) -> tuple[Any, Bundle
     done = 0
     while True:
         tick(2 * done + 1, 2 * m.refine_rounds)
-        found = geometry_of(model, job.folder / MODEL)
+        found = mapping.geometry_of(model, job.folder / MODEL)
         robot = np.stack([job.robot[n] for n in found.names])
         bundle = adjust(found, robot, job.config.alignment.noise, m)
-        set_geometry(model, bundle.geometry)
+        mapping.set_geometry(model, bundle.geometry)
         done += 1
         tick(2 * done, 2 * m.refine_rounds)
         if done >= m.refine_rounds:
@@ -147,7 +140,7 @@ def _refined(job: Job, database: MatchDatabase, model: Any) -> tuple[Any, Bundle
 
 def _with_points(job: Job, database: MatchDatabase, model: Any, limit_px: float) -> Any:
     """Return the model with points triangulated at its cameras."""
-    model = triangulated(model, database, job.config, limit_px, job.folder / WORK)
+    model = mapping.triangulated(model, database, job.config, limit_px, job.folder / WORK)
     if len(model.points3D) < LEAST_IN_VIEW:
         raise DegenerateError(
             f"only {len(model.points3D)} points fit the robot's camera poses within {limit_px:g} "
@@ -160,7 +153,7 @@ def _with_points(job: Job, database: MatchDatabase, model: Any, limit_px: float)
 
 def _known(job: Job, model: Any, Ts: Array) -> Mapped:
     """Return the model at the robot's poses, with the sigma of their scale."""
-    found = geometry_of(model, job.folder / MODEL)
+    found = mapping.geometry_of(model, job.folder / MODEL)
     robot = np.stack([job.robot[n] for n in found.names])
     alignment = align_to_robot(
         found.names, found.Ts_world_cam, robot, job.config.alignment,
