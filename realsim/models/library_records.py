@@ -7,13 +7,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.models.model_records import (
-    ConvexParts,
-    MeshReport,
-    PhysicalProperties,
-    ScanUnit,
-    Symmetries,
-)
+from realsim.models import model_records
 from realsim.records import Mesh, ObjectModel, Verdict
 
 PROPERTIES_FORMAT = 1
@@ -55,7 +49,7 @@ class ScanSource:
     file: str
     """Its name, without the folder."""
     sha256: str
-    unit: ScanUnit
+    unit: model_records.ScanUnit
     factor: float
     """What its numbers were multiplied by."""
     R_up: Array
@@ -88,14 +82,14 @@ class ModelProperties:
     obj_id: int | None = None
     """BOP id; None where the model has no metric scale yet."""
     source: ScanSource | None = None
-    before: MeshReport | None = None
+    before: model_records.MeshReport | None = None
     """The mesh as it came."""
-    after: MeshReport | None = None
+    after: model_records.MeshReport | None = None
     """The mesh as it is kept."""
     actions: tuple[str, ...] = ()
     """What was repaired or made coarser, one sentence each."""
-    symmetries: Symmetries | None = None
-    matter: PhysicalProperties | None = None
+    symmetries: model_records.Symmetries | None = None
+    matter: model_records.PhysicalProperties | None = None
     convex: ConvexNote | None = None
     scale: ScaleNote | None = None
     """None: the unit of the file is the scale."""
@@ -113,7 +107,7 @@ class LibraryModel:
     """A model as the stages need it."""
 
     model: ObjectModel
-    parts: ConvexParts | None
+    parts: model_records.ConvexParts | None
     """None: no convex parts are kept, or not of this mesh."""
     properties: ModelProperties | None
     """None: a models folder of another program has none."""
@@ -130,8 +124,8 @@ class LibraryModel:
 class KnownSolid:
     """What a physics engine needs of a model, as the library knows it."""
 
-    parts: ConvexParts
-    matter: PhysicalProperties
+    parts: model_records.ConvexParts
+    matter: model_records.PhysicalProperties
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -19,7 +19,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
-from realsim.registration import second_look
+from realsim.registration import reports, second_look
 from realsim.registration.blind import Kept, Uncertainty, uncertainty
 from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import spread_frames
@@ -53,13 +53,6 @@ from realsim.registration.registered import (
     missing_report,
     with_rejected,
     without_inventions,
-)
-from realsim.registration.reports import (
-    camera_report,
-    common_report,
-    object_report,
-    photo_report,
-    plane_report,
 )
 from realsim.registration.rivals_around import Around, integrated
 from realsim.registration.search.records import NotPlaced, Wanted
@@ -234,7 +227,7 @@ def _fit_many(
             for v, number in enumerate(numbers)
         },
         findings=[*moved, *second_look.views_off(intake, many, claimed)],
-        report={"refinement": camera_report(many, claimed, numbers)},
+        report={"refinement": reports.camera_report(many, claimed, numbers)},
     )  # fmt: skip
 
 
@@ -340,7 +333,7 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
         poses=poses, frames=intake.frames, views=intake.views, fixed=(), kept=kept,
         uncertain=uncertain,
         searches=[{**r, **f.report} for r, f in zip(found.reports, few.found, strict=True)],
-        seen={}, findings=[], report={"joint": few.history, **photo_report(photo)},
+        seen={}, findings=[], report={"joint": few.history, **reports.photo_report(photo)},
     )  # fmt: skip
 
 
@@ -353,7 +346,7 @@ def _nothing(task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...
         fixed_cameras=_said(task.intake.fixed), seen={}, not_placed=missing,
         findings=task.intake.findings,
         report={"frames": [f.index for f in task.intake.frames], "objects": [],
-                "plane": plane_report(task.intake.plane, task.intake.no_plane),
+                "plane": reports.plane_report(task.intake.plane, task.intake.no_plane),
                 "search": found.report},
     )  # fmt: skip
 
@@ -389,8 +382,8 @@ def _registration(
         "frames": [f.index for f in intake.frames],
         "stride_px": round(float(np.sqrt(intake.views[0].area_px))),
         "noise_per_m": intake.noise.per_m,
-        "plane": plane_report(given.plane, intake.no_plane),
-        **common_report(given, objects),
+        "plane": reports.plane_report(given.plane, intake.no_plane),
+        **reports.common_report(given, objects),
         "search": found.report,
         "single_view": single_report,
         "not_placed": missing_report(missing),
@@ -398,7 +391,7 @@ def _registration(
         "kinematics": None if task.kinematics is None else task.kinematics.as_json(),
         **fit.report,
         "objects": [
-            {**object_report(*one), "symmetry": task.symmetry_words.get(one[1].obj_id, "")}
+            {**reports.object_report(*one), "symmetry": task.symmetry_words.get(one[1].obj_id, "")}
             for one in zip(
                 given.bodies, objects, fit.kept, fit.searches, fit.uncertain, strict=True
             )

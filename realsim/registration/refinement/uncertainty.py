@@ -14,13 +14,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import (
-    HAND_EYE_AT,
-    OBJECTS,
-    centre_pose,
-    moves_of_all,
-    object_at,
-)
+from realsim.registration.refinement import equations
 from realsim.registration.refinement.refine import Refined
 
 TINY = 1e-16
@@ -43,7 +37,7 @@ class SeenPose:
 
 def object_covariance(refined: Refined, body: Body, k: int) -> Array:
     """Return the covariance (6, 6) of T_world_obj: right perturbation, rotation first [rad, m]."""
-    at = object_at(k)
+    at = equations.object_at(k)
     # T exp(xi) with xi about the object's origin: T c exp(eta) c^-1, xi = Ad(c) eta.
     Ad = se3.adjoint(se3.from_translation(body.center_obj))
     return _symmetric(Ad @ refined.covariance.shared[np.ix_(at, at)] @ Ad.T)
@@ -59,8 +53,8 @@ def common_and_own(refined: Refined, bodies: Sequence[Body]) -> tuple[Array, Arr
     Returns:
         (6, 6), and (K, 6, 6) about the objects' centres in their axes [rad, m].
     """
-    C = refined.covariance.shared[OBJECTS:, OBJECTS:]
-    moves = moves_of_all(bodies, refined.state)[OBJECTS:]
+    C = refined.covariance.shared[equations.OBJECTS :, equations.OBJECTS :]
+    moves = equations.moves_of_all(bodies, refined.state)[equations.OBJECTS :]
     weighted = np.linalg.solve(C + TINY * np.eye(len(C)), moves)
     nearest = np.linalg.solve(moves.T @ weighted, weighted.T)
     left = np.eye(len(C)) - moves @ nearest
@@ -84,8 +78,8 @@ def seen_poses(
 def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) -> list[SeenPose]:
     """Return one object's pose in every view."""
     C = refined.covariance
-    picked = np.concatenate([object_at(k), HAND_EYE_AT])
-    T_centre = centre_pose(body, refined.poses[k])
+    picked = np.concatenate([equations.object_at(k), equations.HAND_EYE_AT])
+    T_centre = equations.centre_pose(body, refined.poses[k])
     Ms = se3.invert(T_centre) @ refined.cameras
     Ad = se3.adjoint(Ms)
     # Columns: object, hand-eye, view. The twist of T_cam_obj is xi_o - Ad(M) (hand-eye + view).
