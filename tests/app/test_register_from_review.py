@@ -7,14 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import refusals
 from realsim.app import stages
+from realsim.app.annotate import current
+from realsim.app.annotate.current import annotate_session, refresh_labels, what_is_stale
+from realsim.app.console import Console
+from realsim.app.export.request import ExportRequest
+from realsim.app.export.run import run_export
 from realsim.app.register.from_review import moved_since_accepted, review_starts, stayed
 from realsim.app.register.results import load_registered, with_objects
+from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
-from realsim.records import ObjectPose
+from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim.review import journal
 from realsim.review.corrections import decision_on
-from realsim.store import SessionStore, load_scene, save_scene
+from realsim.store import SessionStore, load_scene, provenance, save_scene
+from registered_sessions import true_poses
 from shared_sessions import copy_of
 from typed_commands import finished, invoked, refused
 
@@ -170,3 +178,105 @@ def test_a_journal_of_damage_alone_is_not_taken_for_none(session: SessionStore) 
     session.path(journal.JOURNAL_FILE).write_bytes(b"\x00\xff\n\x01\n")
     said = refused("register", session.folder, "--from-review")
     assert "line 1, 2 of" in said and "empty" not in said
+
+
+# --- Labels follow the reviewed scene: no export hands out those of before the review -----------
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def labelled(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = SessionStore.open(copy_of(few_views, tmp_path_factory.mktemp("labelled") / "s"))
+    plane = SupportPlane(T_world_table=np.eye(4))
+    save_scene(store, Scene(name="s", objects=tuple(true_poses()), plane=plane))
+    annotate_session(store, QUIET, maps="instance")
+    return store.folder
+
+
+@pytest.fixture
+def annotated(labelled: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(copy_of(labelled, tmp_path / "s"))
+
+
+def test_what_nobody_touched_is_current_and_not_computed_again(annotated: SessionStore) -> None:
+    assert what_is_stale(annotated) == ""
+    assert not refresh_labels(annotated, QUIET)
+
+
+def test_frames_are_said_to_show_other_grasps_where_they_do(annotated: SessionStore) -> None:
+    assert current.other_grasps_shown(annotated) == ""
+    annotated.write_bytes("grasps/000000_obj000001.npz", b"first")
+    assert current.other_grasps_shown(annotated) == "show no grasps yet"
+    now = provenance.inputs_of(annotated, current.GRASPS)
+    record, run = provenance.read(annotated.folder, "annotate")
+    provenance.write(annotated, replace(record, inputs=now), run)
+    assert current.other_grasps_shown(annotated) == ""
+    annotated.write_bytes("grasps/000000_obj000001.npz", b"anew")
+    assert current.other_grasps_shown(annotated) == "still show the grasps of before"
+
+
+def test_every_decision_that_changes_labels_is_noticed(annotated: SessionStore) -> None:
+    first, second = load_scene(annotated).objects[:2]
+    T = first.T_world_obj @ se3.from_translation([0.004, 0, 0])
+    decisions: list[tuple[journal.Action, ObjectPose | None, dict[str, object], str]] = [
+        ("reject", first, {}, "is rejected"),
+        ("swap", first, {"pose": first.T_world_obj, "obj_id": second.obj_id}, "is object"),
+        ("exclude", None, {"view": 2}, "view 2"),
+        ("move", first, {"pose": T}, "was moved"),
+    ]
+    for action, placed, said, words in decisions:
+        annotated.path(journal.JOURNAL_FILE).unlink(missing_ok=True)
+        say(annotated, action, placed, **said)
+        assert words in what_is_stale(annotated)
+    say(annotated, "comment", second, comment="nothing changes by this")
+    assert refresh_labels(annotated, QUIET)
+    again = SessionStore.open(annotated.folder)
+    assert what_is_stale(again) == ""
+    assert not refresh_labels(again, QUIET)
+
+
+def test_cameras_that_changed_a_little_at_a_time_make_labels_stale(annotated: SessionStore) -> None:
+    lens, cameras = annotated.session.intrinsics, annotated.session.Ts_world_cam
+    for _ in range(2):
+        cameras[1] = cameras[1] @ se3.from_translation([2e-4, 0, 0])
+        annotated.set_cameras(lens, cameras)
+        assert what_is_stale(annotated) == "view 1 was labelled with its camera elsewhere"
+    assert refresh_labels(annotated, QUIET) and not refresh_labels(annotated, QUIET)
+    annotated.set_cameras(replace(lens, fx=1.001 * lens.fx), cameras)
+    assert what_is_stale(annotated) == "view 0 was labelled with another lens"
+
+
+def test_an_export_carries_the_reviewed_poses_and_leaves_out_what_was_rejected(
+    annotated: SessionStore, tmp_path: Path
+) -> None:
+    first, second = load_scene(annotated).objects[:2]
+    T = first.T_world_obj @ se3.exp([0, 0, 0.1, 0.004, 0, 0])
+    say(annotated, "move", first, pose=T)
+    say(annotated, "reject", second)
+    request = ExportRequest(sources=(annotated.folder,), target="bop")
+    run_export(request, tmp_path / "out", QUIET)
+    (ref,) = find_scenes(tmp_path / "out")
+    scene = read_scene(ref)
+    view = annotated.session.view(0)
+    assert view.T_world_cam is not None
+    expected = se3.invert(view.T_world_cam) @ T
+    labels = {a.obj_id: a.T_cam_obj for a in scene.ground_truth[0]}
+    np.testing.assert_allclose(labels[first.obj_id], expected, atol=1e-6)
+    assert second.obj_id not in labels
+
+
+def test_only_what_a_review_changes_makes_it_another_export(
+    annotated: SessionStore, tmp_path: Path
+) -> None:
+    request = ExportRequest(sources=(annotated.folder,), target="bop")
+    run_export(request, tmp_path / "out", QUIET)
+    for name in ("reports/a.html", "review/thumbnails/000000.jpg"):
+        path = annotated.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+    assert run_export(request, tmp_path / "out", QUIET).was_finished
+    say(annotated, "reject", load_scene(annotated).objects[0])
+    refusals.refused(
+        "finished export.*delete that one first", run_export, request, tmp_path / "out", QUIET
+    )

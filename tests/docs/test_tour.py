@@ -1,7 +1,8 @@
-"""The tour is true: its commands run in order on one data set and print what the text says."""
+"""The tour and the guides are true: their commands run in order and print what the text says."""
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -72,3 +73,31 @@ def snippets_of_the_reference_run(folder: Path) -> None:
     )
     printed = run([sys.executable, "-c", code], folder).split("--- next\n")[1:]
     assert len(printed) == len(snippets) > 8 and all(text.strip() for text in printed)
+
+
+# --- The guides, likewise
+
+PLAYED = ("calibrate-a-new-lab", "your-own-gripper")
+"""A lab of its own, board views first: plan, capture, calibrate, and the figures of all three; a
+gripper that is not in the package: described, proven and simulated."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guide", PLAYED)
+def test_a_guide_prints_what_it_says(guide: str, tmp_path: Path) -> None:
+    wrong = play(ROOT / f"docs/how-to/{guide}.md", tmp_path)
+    assert not wrong, "\n\n".join(wrong)
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_not_in_the_package_is_proven_planned_for_and_captured_with(
+    tmp_path: Path,
+) -> None:
+    robots = Path("examples/robots")
+    shutil.copytree(ROOT / robots, tmp_path / robots)
+    wrong = play(ROOT / "docs/how-to/your-own-arm.md", tmp_path)
+    assert not wrong, "\n\n".join(wrong)
+    header = json.loads((tmp_path / "own/session.json").read_text())
+    assert header["extra"]["arm"] == "SixJoint"
+    plan = json.loads((tmp_path / "own.json").read_text())["content"]
+    assert plan["robot"] == "SixJoint" and plan["metrics"]["colliding_legs"] == 0
