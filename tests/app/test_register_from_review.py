@@ -1,4 +1,4 @@
-"""`realsim register --from-review`: what reviewers said is where the registration starts from."""
+"""What reviewers said is where `realsim register --from-review` starts from; labels follow it."""
 
 import json
 from dataclasses import replace

@@ -1,6 +1,5 @@
 """The replay of a grasp: its record, the approach made from the grasp, the player, the words."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -19,6 +18,7 @@ from realsim.robots.hand import find_hand
 from refusals import refused
 from reviewed_boxes import grasp_set
 from tried_grasps import tried_set
+from waiting import comes_about
 
 WIDTH_M = 0.03
 TRIANGLE = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]], dtype=np.int32))
@@ -105,23 +105,13 @@ def player_of(server: viser.ViserServer, motions: Motions, **kwargs: object) -> 
     return ReplayPlayer(server.scene, server.gui, motions, atomic=server.atomic, **kwargs)  # pyright: ignore[reportArgumentType]
 
 
-def wait(until: object, seconds: float = 20.0) -> bool:
-    assert callable(until)
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if until():
-            return True
-        time.sleep(0.01)
-    return False
-
-
 def test_a_replay_runs_to_its_end_and_carries_the_object(server: viser.ViserServer) -> None:
     told: list[tuple[int, bool]] = []
     motion = carried()
     player = player_of(server, Given(motion), on_carried=lambda i, c: told.append((i, c)))
     shown = player.show(1, 0)
     assert shown is not None and shown.row == 0 and player.playing
-    assert wait(lambda: not player.playing)
+    assert comes_about(lambda: not player.playing)
     assert player.time_s == pytest.approx(motion.time_s[-1])
     assert told == [(1, True)]
     node = player._nodes._object  # pyright: ignore[reportPrivateUsage]
@@ -157,10 +147,10 @@ def test_another_grasp_ends_the_thread_of_the_one_before(server: viser.ViserServ
     player = player_of(server, Given(carried(60.0, 5.0)))
     for row in range(5):
         player.show(0, row)
-    assert wait(lambda: threads() == 1)
+    assert comes_about(lambda: threads() == 1)
     assert player.motion is not None and player.motion.row == 4
     player.pause()
-    assert wait(lambda: threads() == 0)
+    assert comes_about(lambda: threads() == 0)
     assert player.show(0, 9) is None and player.motion is None, "nothing is known of row 9"
 
 
@@ -170,7 +160,7 @@ def test_a_browser_that_is_gone_ends_the_replay(server: viser.ViserServer) -> No
     player.show(0, 0)
     assert player.playing
     there[0] = False
-    assert wait(lambda: not player.playing)
+    assert comes_about(lambda: not player.playing)
     player.clear()
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import logging
 import os
 import re
 import socket
@@ -23,6 +24,7 @@ from realsim.store import SessionStore
 from refusals import refused
 from review_browser import CAMERA, SOCKET, serving
 from reviewed_boxes import boxes_session
+from waiting import comes_about
 
 TOKEN = "a-secret-of-more-than-16"
 
@@ -78,6 +80,10 @@ def handshake(server: ReviewServer, origin: str | None = None, **headers: str) -
             return 101
     except InvalidStatus as refused:
         return refused.response.status_code
+
+
+def troubles(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
+    return [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")]
 
 
 # --- where it listens -------------------------------------------------------------------------
@@ -190,7 +196,7 @@ def test_addresses_that_are_none_are_answered_without_a_traceback(
     server: ReviewServer, head: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert raw(server, f"{head}\n").split(" ")[1] in ("400", "404")
-    assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+    assert troubles(caplog) == []
 
 
 def test_a_browser_that_leaves_before_it_is_answered_fills_no_terminal(
@@ -202,11 +208,8 @@ def test_a_browser_that_leaves_before_it_is_answered_fills_no_terminal(
                 line.sendall(b"GET /photograph/9/-/strip HTTP/1.1\r\nHost: localhost\r\n\r\n")
                 time.sleep(0.2)
             time.sleep(0.2)
-        end = time.monotonic() + 20
-        while not any("ended before" in r.getMessage() for r in caplog.records):
-            assert time.monotonic() < end
-            time.sleep(0.02)
-    assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+        assert comes_about(lambda: any("ended before" in r.getMessage() for r in caplog.records))
+    assert troubles(caplog) == []
 
 
 @pytest.mark.parametrize(
@@ -224,15 +227,13 @@ def test_a_frame_that_is_no_message_gets_a_line_in_the_log(
         for part in frame if isinstance(frame, list) else [frame]:
             line.send(part)
         with contextlib.suppress(ConnectionClosed):
-            pong, end = line.ping(), time.monotonic() + 20
-            while not pong.wait(0.05) and line.close_code is None:  # a closed line never answers
-                assert time.monotonic() < end
+            pong = line.ping()  # a closed line never answers
+            assert comes_about(lambda: pong.is_set() or line.close_code is not None)
     assert handshake(server) == 101
-    end, told = time.monotonic() + 20, []
-    while not told and time.monotonic() < end:  # a connection that it closes is logged after that
-        time.sleep(0.02)
-        told = [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")]
-    assert {"was not understood" in r.getMessage() and not r.exc_info for r in told} == {True}
+    # A connection that it closes is logged after that.
+    assert comes_about(lambda: troubles(caplog))
+    for record in troubles(caplog):
+        assert "was not understood" in record.getMessage() and not record.exc_info
 
 
 def test_a_frame_beyond_all_sizes_and_an_upload_fill_no_memory(server: ReviewServer) -> None:

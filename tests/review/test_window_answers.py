@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import threading
-import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -32,6 +31,7 @@ from realsim.store import SessionStore, save_grasps, save_scene
 from realsim.store.session_store import rgb_path
 from review_browser import CAMERA, SOCKET, serving
 from reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
+from waiting import comes_about
 
 RED, ORANGE = "realsim-message alarm", "realsim-message refused"
 
@@ -72,10 +72,7 @@ class Page:
         return self.window._message.content  # pyright: ignore[reportPrivateUsage]
 
     def wait(self, until: Callable[[], bool], seconds: float = 30.0) -> None:
-        end = time.monotonic() + seconds
-        while not until():
-            assert time.monotonic() < end, "it did not come about"
-            time.sleep(0.02)
+        assert comes_about(until, seconds), "it did not come about"
 
     def wait_message(self, words: str, color: str) -> None:
         try:
