@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from documented_commands import documented
+from documents import documented
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("realsim", "realsim_calibration", "realsim_capture_plans", "realsim_sim_bridge")

@@ -13,6 +13,7 @@ import typed_commands
 from begun_sessions import begun
 from file_trees import bytes_of
 from photographed_boards import photograph
+from pictured_targets import pose
 from realsim.app.calibrate.run import require_no_bag
 from realsim.app.calibrate.session import keep_board
 from realsim.app.register.files import write_result
@@ -36,18 +37,12 @@ VIEWS = 12
 
 def hand_poses(rng: np.random.Generator) -> tuple[Array, Array]:
     """Return T_base_ee and T_cam_board (n, 4, 4) of tilted, rolled views of the board."""
-    width, height = BOARD.size_m
-    middle = np.array([width / 2, height / 2, 0.0])
     T_base_board = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.35, 0.1, 0.0])
-    hands, seen = [], []
-    for k in range(VIEWS):
-        tilt, azimuth = np.radians(rng.uniform(10, 40)), 2 * np.pi * k * 0.618
-        away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
-        eye = middle + rng.uniform(0.28, 0.38) * np.array(away)
-        T_board_cam = se3.look_at(eye, middle, -np.pi + 2 * np.pi * k / VIEWS)
-        hands.append(T_base_board @ T_board_cam @ se3.invert(T_EE_CAM))
-        seen.append(se3.invert(T_board_cam))
-    return np.array(hands), np.array(seen)
+    seen = [
+        pose(BOARD, rng.uniform(10, 40), 222.5 * k, 360 * k / VIEWS - 180, rng.uniform(0.28, 0.38))
+        for k in range(VIEWS)
+    ]
+    return T_base_board @ se3.invert(T_EE_CAM @ np.array(seen)), np.array(seen)
 
 
 def board_views(folder: Path, **header: str) -> Path:

@@ -43,10 +43,6 @@ def read(text: str) -> dict[str, Any]:
     return settings_of(commands, read_config(written(text), "", is_named=True))
 
 
-def refusal(text: str) -> str:
-    return refused(".", read, text)
-
-
 def show(*args: str) -> dict[str, Any]:
     return json.loads(finished(*args, "--json").stdout)
 
@@ -60,12 +56,8 @@ def in_force(command: str, option: str, *before: str) -> tuple[Any, str]:
 # --- the template is the whole truth ------------------------------------------------------------
 
 
-def uncommented() -> str:
-    return re.sub(r"^# (?=[a-z0-9-]+ = )", "", template(EVERY), flags=re.MULTILINE)
-
-
 def test_the_template_without_its_comment_marks_sets_every_option_to_its_default() -> None:
-    settings = read(uncommented())
+    settings = read(re.sub(r"^# (?=[a-z0-9-]+ = )", "", template(EVERY), flags=re.MULTILINE))
     for path, command in EVERY.items():
         here: Any = settings
         for name in path:
@@ -227,7 +219,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("text", REFUSED)
 def test_what_cannot_be_used_is_named_with_its_line_and_what_would_do(text: str) -> None:
-    said = refusal(text)
+    said = refused(".", read, text)
     for words in REFUSED[text]:
         assert words in said, said
     assert "\n" not in said

@@ -254,14 +254,13 @@ def photo(T_world_cam: np.ndarray) -> np.ndarray:
     """Return the picture of the two squares: each is seen through a homography."""
     import cv2
 
-    K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1.0]])
     T = se3.invert(T_world_cam)
     seen = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
     for k, (z, side) in enumerate(zip(LEVELS_M, SIDES_M, strict=True)):
         texture = print_of(k, round(1500 * side))
         s = side / len(texture)
         plane = np.array([[s, 0, -side / 2], [0, s, -side / 2], [0, 0, z], [0, 0, 1]])
-        H = K @ (T[:3] @ plane)
+        H = CAMERA.K @ (T[:3] @ plane)
         size = (CAMERA.width, CAMERA.height)
         warped = cv2.warpPerspective(texture, H, size, flags=cv2.INTER_AREA)
         cover = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), H, size)

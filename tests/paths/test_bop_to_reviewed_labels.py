@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from documented_commands import as_arguments, documented
+from documents import as_arguments, documented
 from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.records import Scene

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from documented_commands import as_arguments, documented
+from documents import as_arguments, documented
 from realsim.arrays import Array, Array32, UInt8
 from realsim.geometry import camera, se3
 from realsim.images.png import encode_png

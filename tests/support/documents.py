@@ -3,6 +3,7 @@
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,28 @@ def typed_commands(text: str) -> list[str]:
                     if COMMAND.match(part.strip()):
                         lines.append(COMMAND.sub("realsim", part.strip()))
     return lines
+
+
+def documented(document: str, *words: str) -> str:
+    """Return the first command line of a document in which all words stand, or fail."""
+    for block in blocks((ROOT / document).read_text()):
+        for line in block.text.splitlines():
+            if all(word in line.split() for word in words):
+                return line.split("  #")[0].strip()
+    raise AssertionError(f"{document} has no command with {' '.join(words)}")
+
+
+def as_arguments(line: str, **replaced: str) -> list[str]:
+    """Return what to start for a line `[uv run] realsim ...`: the program that is installed.
+
+    Args:
+        line: as of `documented`.
+        replaced: words in capitals, such as FOLDER, and what stands for them.
+    """
+    words = shlex.split(line)
+    words = words[words.index("realsim") + 1 :]
+    program = str(Path(sys.executable).with_name("realsim"))
+    return [program, *(replaced.get(word, word) for word in words)]
 
 
 def named_commands(text: str) -> Iterator[tuple[str, str]]:
