@@ -40,8 +40,7 @@ def painted():
         rgb = cv2.resize(rgb.astype(np.uint8), (640, 360), interpolation=cv2.INTER_LINEAR)
         depth = cv2.resize(frame.depth_m, (640, 360), interpolation=cv2.INTER_NEAREST)
         pairs.append((rgb, depth))
-    camera = CameraIntrinsics(width=640, height=360, fx=324, fy=324, cx=319.5, cy=179.5)
-    return camera, pairs
+    return CameraIntrinsics(width=640, height=360, fx=324, fy=324, cx=319.5, cy=179.5), pairs
 
 
 @cache
@@ -68,8 +67,7 @@ def test_a_shift_is_measured():
     dx, dy = 9, 12
     still, found = pooled(painted), pooled(painted, dx=dx, dy=dy)
     assert found.kind == "not_aligned" and found.stretch == (1.0, 1.0)
-    moved = np.array(found.shift_px) - still.shift_px
-    assert np.allclose(moved, [dx, dy], atol=1.0)
+    assert np.allclose(np.array(found.shift_px) - still.shift_px, [dx, dy], atol=1.0)
     assert "below" in found.words and f"{found.agreeing} of 4 views" in found.words
     assert found.agreeing >= 3
 
@@ -84,8 +82,7 @@ def test_a_stretch_is_measured():
 def test_one_view_is_enough_to_name_a_resized_or_moved_depth():
     for warp in ({}, {"sx": 0.75}, {"sx": 0.85, "sy": 1.12}, {"dx": 9, "dy": 12}):
         kinds = [pooled(painted, n, **warp).kind for n in range(2)]
-        allowed = {"not_aligned", "unknown"} if warp else {"aligned", "unknown"}
-        assert set(kinds) <= allowed
+        assert set(kinds) <= {"not_aligned" if warp else "aligned", "unknown"}
         assert not warp or "not_aligned" in kinds
 
 

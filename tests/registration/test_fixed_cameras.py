@@ -87,8 +87,7 @@ def centre_error_mm(scene, pose: ObjectPose) -> float:
 def seen_error_mm(T: np.ndarray, T_true: np.ndarray) -> float:
     """By how much a camera sees a point in the middle of the table beside where it is."""
     middle = np.array([[0.0, 0.0, 0.02]])
-    there = se3.transform(T @ se3.invert(T_true), middle)
-    return 1e3 * float(np.linalg.norm(there - middle))
+    return 1e3 * float(np.linalg.norm(se3.transform(T @ se3.invert(T_true), middle) - middle))
 
 
 def test_what_the_hand_sees_from_one_side_becomes_surer_with_each_fixed_camera(
@@ -123,9 +122,8 @@ def test_too_few_views_for_a_joint_fit_leave_fixed_cameras_out_and_say_so(one_si
     starts = starts_off_by(one_sided, 2, 2, seed=2)
     found = register(one_sided, starts, frames=one_sided.frames[:2], fixed=[frames])
     assert found.fixed_cameras == {}
-    said = [f.words for f in found.findings if f.kind == "fixed_cameras"]
-    assert len(said) == 1
-    assert "fixed0" in said[0]
+    (said,) = [f.words for f in found.findings if f.kind == "fixed_cameras"]
+    assert "fixed0" in said
 
 
 def test_images_of_another_size_than_the_camera_are_named(one_sided):

@@ -95,8 +95,7 @@ def test_boxes_and_masks_lead_to_the_object():
 
 def test_without_depth_the_table_tells():
     scene_, scene, _ = setting()
-    frames = {k: without_any_depth(f) for k, f in scene.frames.items()}
-    blind = replace(scene, frames=frames)
+    blind = replace(scene, frames={k: without_any_depth(f) for k, f in scene.frames.items()})
     for view, pose, model, rows, columns in seen_well():
         click = Click(view=view, pixel=(float(np.median(columns)), float(np.median(rows))))
         hint = Hint(obj_id=pose.obj_id, instance=0, where=click)

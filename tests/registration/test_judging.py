@@ -48,8 +48,7 @@ def watched():
 
 
 def checks_of(results):
-    level = error_level_m(results)
-    return [residual_checks(r, level) for r in results]
+    return [residual_checks(r, error_level_m(results)) for r in results]
 
 
 def test_true_poses_leave_no_wrong_surface(watched):
@@ -66,8 +65,7 @@ def test_a_gear_turned_by_half_a_tooth_leaves_much(watched):
     order = len(bodies[0].model.symmetries) // 2
     C = se3.from_translation(bodies[0].center_obj)
     turned = poses[0] @ C @ se3.exp([0, 0, np.pi / order, 0, 0, 0]) @ se3.invert(C)
-    wrong = [turned, *poses[1:]]
-    first, *others = checks_of(residuals(wrong))
+    first, *others = checks_of(residuals([turned, *poses[1:]]))
     assert first["wrong_surface"] > 0.1
     assert first["wrong_patch_mm2"] > 100
     assert all(c["wrong_surface"] < 0.02 for c in others)
@@ -87,8 +85,7 @@ def test_a_shift_up_is_measured_with_its_sign(watched, millimetres):
 def test_the_world_may_be_turned(watched):
     scene, _, poses, residuals = watched
     G = se3.exp([0.3, -0.5, 1.2, 0.4, -0.2, 0.7])
-    plane = SupportPlane(T_world_table=G)
-    moved = residuals([G @ T for T in poses], G @ scene.Ts_world_cam, plane)
+    moved = residuals([G @ T for T in poses], G @ scene.Ts_world_cam, SupportPlane(T_world_table=G))
     for a, b in zip(residuals(poses), moved, strict=True):
         both = a.measured & b.measured
         assert np.mean(a.measured == b.measured) > 0.99
@@ -98,8 +95,7 @@ def test_the_world_may_be_turned(watched):
 def test_free_space_is_looked_through_where_nothing_stands(watched):
     _, _, poses, residuals = watched
     lifted = se3.from_translation([0, 0, 0.06]) @ poses[1]
-    c = checks_of(residuals([poses[0], lifted, *poses[2:]]))[1]
-    assert c["looked_through"] > 0.5
+    assert checks_of(residuals([poses[0], lifted, *poses[2:]]))[1]["looked_through"] > 0.5
 
 
 def test_errors_that_all_objects_share_raise_the_bound_but_not_without_end(watched):
@@ -225,8 +221,7 @@ def test_a_mesh_in_the_wrong_unit_is_an_error_with_the_number(table, factor):
     model = bodies[0].model
     mesh = replace(model.mesh, vertices=factor * model.mesh.vertices)
     models = {**scene.models, model.obj_id: replace(model, mesh=mesh)}
-    cameras = scene.Ts_world_cam[:, :3, 3]
-    errors = unit_errors(models, scene.truth, cameras, 0.35)
+    errors = unit_errors(models, scene.truth, scene.Ts_world_cam[:, :3, 3], 0.35)
     assert set(errors) == {bodies[0].start.instance}
     (error,) = errors.values()
     assert isinstance(error, UnitError)
@@ -308,21 +303,21 @@ def without(names):
     return {k: v for k, v in GOOD.items() if k not in names}
 
 
+KEPT = (GOOD, without(HELD_OUT), without((*HELD_OUT, *SURFACE)))
+"""All checks, and those that are left where others could not be made."""
+
+
 def test_good_checks_are_believed_and_bad_ones_are_not():
-    assert probability_right(GOOD) > 0.97
-    assert probability_right(without(HELD_OUT)) > 0.95
-    assert probability_right(without((*HELD_OUT, *SURFACE))) > 0.8
-    for kept in (GOOD, without(HELD_OUT), without((*HELD_OUT, *SURFACE))):
+    for kept, least in zip(KEPT, (0.97, 0.95, 0.8), strict=True):
+        assert probability_right(kept) > least
         assert probability_right({k: BAD.get(k, v) for k, v in kept.items()}) < 0.01
 
 
 def test_more_evidence_never_lowers_it():
-    every = (GOOD, without(HELD_OUT), without((*HELD_OUT, *SURFACE)))
-    for name, kept in product(sorted(BAD), every):
-        steps = np.linspace(0, 1, 15)
+    for name, kept in product(sorted(BAD), KEPT):
         told = [
             probability_right({**kept, name: (1 - t) * BAD[name] + t * GOOD[name]})
-            for t in steps
+            for t in np.linspace(0, 1, 15)
             if name in kept
         ]
         assert np.all(np.diff(told) >= 0)
@@ -346,8 +341,7 @@ def test_an_undecided_rival_makes_it_doubtful():
 
 def test_verdicts_have_reasons_with_numbers_in_words():
     assert verdict_of(0.99, GOOD) == ("accepted", ())
-    features = {**GOOD, "wrong_surface": 0.12}
-    verdict, reasons = verdict_of(0.5, features)
+    verdict, reasons = verdict_of(0.5, {**GOOD, "wrong_surface": 0.12})
     assert verdict == "doubtful"
     assert "0.12 of its seen surface is more than 1.0 mm off" in reasons
     verdict, reasons = verdict_of(0.001, {**GOOD, **BAD})

@@ -59,8 +59,8 @@ def case() -> Case:
 
 def errors(many: ManyViews) -> list[float]:
     """Return the objects' errors [mm]."""
-    found = zip(case().scene.truth, many.poses, strict=True)
-    placed = [replace(p, T_world_obj=T) for p, T in found]
+    truth = case().scene.truth
+    placed = [replace(p, T_world_obj=T) for p, T in zip(truth, many.poses, strict=True)]
     return [*errors_mm(case().scene, placed).values()]
 
 

@@ -43,8 +43,7 @@ def exact_grid(model, T_world_obj, cells=140):
     """The heights of one mesh on an endless table, by ray casting: no noise, nothing missing."""
     cell, origin = 0.003, np.full(2, -0.0015 * cells)
     grid = HeightGrid(heights=np.zeros((cells, cells), np.float32), origin=origin, cell_m=cell)
-    xy = grid.centers().reshape(-1, 2)
-    z = seen_from_above(model.mesh, T_world_obj, xy)
+    z = seen_from_above(model.mesh, T_world_obj, grid.centers().reshape(-1, 2))
     heights = np.where(np.isfinite(z), z, 0.0).reshape(cells, cells).astype(np.float32)
     return HeightGrid(heights=heights, origin=origin, cell_m=cell)
 
@@ -187,8 +186,7 @@ def test_a_box_rests_on_three_sides_and_looks_the_same_after_half_a_turn():
     assert (len(known.rotations), len(unknown.rotations)) == (3, 6)
     assert set(known.yaw_counts) == {12} and set(unknown.yaw_counts) == {24}
     assert np.isclose(known.probabilities.sum(), unknown.probabilities.sum())
-    heights = sorted(float(p[:, 2].mean()) for p in known.points)
-    assert np.allclose(heights, size, atol=1e-6)
+    assert np.allclose(sorted(float(p[:, 2].mean()) for p in known.points), size, atol=1e-6)
 
 
 def test_kept_templates_are_the_same_and_a_damaged_file_is_computed_again(tmp_path):
@@ -217,8 +215,7 @@ def gap(model, T, Ts):
     box = box_mesh(*model.mesh.bounds).vertices
     S = symmetry_transforms(model, np.radians(1))
     images = se3.transform((Ts[:, None] @ S[None]).reshape(-1, 4, 4), box)
-    shifts = np.linalg.norm(images - se3.transform(T, box), axis=2)
-    return float(shifts.max(1).min())
+    return float(np.linalg.norm(images - se3.transform(T, box), axis=2).max(1).min())
 
 
 def about_z(deg, x=0.0):
@@ -231,8 +228,7 @@ def test_a_gear_turned_by_half_a_tooth_is_found():
     gear = part("gear")
     steps = np.degrees(se3.angle(gear.symmetries))
     tooth = steps[steps > 1].min()
-    Ts = near_symmetries(gear, NEAR, None)
-    assert gap(gear, about_z(tooth / 2), Ts) < 0.002
+    assert gap(gear, about_z(tooth / 2), near_symmetries(gear, NEAR, None)) < 0.002
     bare = ObjectModel(obj_id=1, name="gear", mesh=gear.mesh)  # nothing declared
     assert len(near_symmetries(bare, NEAR, None)) > 0
 

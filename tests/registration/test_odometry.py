@@ -27,9 +27,8 @@ def views() -> tuple[ViewPoints, ...]:
 
 def checked(order, Ts) -> KinematicsCheck:
     """Return the check of these views in a new order of capture, at these poses."""
-    return check_kinematics(
-        [replace(views()[v], T_world_cam=Ts[k], index=k) for k, v in enumerate(order)], TABLE
-    )
+    captured = [replace(views()[v], T_world_cam=Ts[k], index=k) for k, v in enumerate(order)]
+    return check_kinematics(captured, TABLE)
 
 
 def claimed() -> np.ndarray:
@@ -108,7 +107,6 @@ def test_an_empty_table_is_an_error():
 # --- Camera poses of a capture without a robot.
 
 SAMPLE = SampleConfig(stride=1)
-FRAMES = 12
 
 
 @lru_cache(maxsize=1)
@@ -117,7 +115,7 @@ def led_by_hand():
     scene = small_scene(1, objects=6, views=32)
     rng = np.random.default_rng(7)
     poses = []
-    for k in range(FRAMES):
+    for k in range(12):
         azimuth, height = np.radians(5.0 * k + rng.normal(scale=0.4)), 0.25 + 0.02 * np.sin(k / 3)
         eye = [0.22 * np.cos(azimuth), 0.22 * np.sin(azimuth), height]
         poses.append(se3.look_at(eye, [*rng.normal(scale=0.003, size=2), 0.03], 0.1 * np.sin(k)))
@@ -170,7 +168,6 @@ def test_a_missing_piece_of_the_way_is_named():
 
 def test_without_a_table_there_is_no_ground():
     intrinsics, depths, _ = led_by_hand()
-    rng = np.random.default_rng(0)
-    wild = rng.uniform(0.2, 0.6, depths[0].shape).astype(np.float32)
+    wild = np.random.default_rng(0).uniform(0.2, 0.6, depths[0].shape).astype(np.float32)
     with pytest.raises((DegenerateError, InputError), match="view 0"):
         hand_held_poses(intrinsics, [wild, depths[1]], SAMPLE)

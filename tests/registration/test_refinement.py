@@ -238,9 +238,7 @@ def test_covariance_in_a_view_is_that_of_samples_of_everything():
     rng = np.random.default_rng(1)
     k, v, body = 2, 5, case.bodies[2]
     told, C = seen[k][v], refined.covariance
-    at = np.r_[
-        np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6), np.arange(HAND_EYE.start, HAND_EYE.stop)
-    ]
+    at = np.r_[OBJECTS + 6 * k : OBJECTS + 6 * k + 6, HAND_EYE]
     joint = np.block([
         [C.shared[np.ix_(at, at)], C.cross[v][at, :6]],
         [C.cross[v][at, :6].T, C.views[v][:6, :6]],

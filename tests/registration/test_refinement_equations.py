@@ -108,12 +108,10 @@ def some_point(rng: np.random.Generator, body: Body | None, bias=(1.0, 0.0)) -> 
     if body is not None:
         normal = rng.normal(size=3)
         normal /= np.linalg.norm(normal)
-    point = OnePoint(
-        state, T_world_cam[None], point_cam, np.zeros(3), normal, [] if body is None else [body]
-    )
+    bodies = [] if body is None else [body]
+    point = OnePoint(state, T_world_cam[None], point_cam, np.zeros(3), normal, bodies)
     # A point whose ray is nearly in the surface says nothing of the depth: look at it from above.
-    M = se3.invert(T) @ T_world_cam
-    ray = M[:3, :3] @ point_cam
+    ray = (se3.invert(T) @ T_world_cam)[:3, :3] @ point_cam
     cosine = abs(ray @ normal) / np.linalg.norm(ray)
     return point if cosine > 0.2 else some_point(rng, body, bias)
 
@@ -234,8 +232,7 @@ def test_point_behind_a_thin_wall_belongs_to_the_side_that_was_seen(exact: bool)
     points = mug.samples[some] - depth * mug.normals[some]
     points_cam = se3.transform(se3.invert(T_obj_cam), points)
     _, distances, normals = residuals(exact, mug, points_cam, T_obj_cam)
-    cosine = np.sum(normals * mug.normals[some], axis=1)
-    assert np.median(cosine) > 0.98
+    assert np.median(np.sum(normals * mug.normals[some], axis=1)) > 0.98
     assert np.median(distances) == pytest.approx(-depth, abs=4e-4 if not exact else 1e-4)
 
 

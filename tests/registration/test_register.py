@@ -104,9 +104,8 @@ def checker(clutter):
     cameras = np.stack([f.T_world_cam[:3, 3] for f in clutter.frames])
     plane, _ = find_support_plane(evidence.support, centers, cameras, PlaneConfig(), 0.001)
     comparer = make_comparer(clutter.intrinsics, clutter.frames, evidence.noise, plane)
-    clouds = [
-        average_cloud(without_table(c, plane, 0.003), np.eye(4), 0.003) for c in evidence.near
-    ]
+    near = [without_table(c, plane, 0.003) for c in evidence.near]
+    clouds = [average_cloud(c, np.eye(4), 0.003) for c in near]
     return lambda poses: verify_objects(bodies, poses, clouds, comparer)
 
 
@@ -138,8 +137,7 @@ def test_solver_stays_at_the_truth_without_noise():
     evidence = gather(scene.intrinsics, scene.frames, [body], EvidenceConfig(noise_per_m=0.001))
     cloud = evidence.near[0].select(evidence.near[0].points[:, 2] > 0.002)
     rough = truth @ se3.exp([0.05, -0.04, 0.06, 0.003, -0.002, 0.002])
-    fit = solve_pose(body, cloud, rough, COARSE + FINE)
-    error = se3.log(se3.invert(truth) @ fit.T_world_obj)
+    error = se3.log(se3.invert(truth) @ solve_pose(body, cloud, rough, COARSE + FINE).T_world_obj)
     assert np.linalg.norm(error[3:]) < 5e-5
     assert np.linalg.norm(error[:3]) < 1e-3
     assert isinstance(body.start, ObjectPose)
@@ -165,12 +163,10 @@ def off(pose: ObjectPose, model, rng) -> ObjectPose:
 def case():
     """(scene, starts, registration); no model declares a symmetry."""
     scene = true_cameras(named_scene(4, ("cylinder_can", "mug"), 6))
-    plain = {
-        k: replace(m, symmetries=np.eye(4)[None], symmetry_axes=()) for k, m in scene.models.items()
-    }
-    scene = replace(scene, models=plain)
+    none = {"symmetries": np.eye(4)[None], "symmetry_axes": ()}
+    scene = replace(scene, models={k: replace(m, **none) for k, m in scene.models.items()})
     rng = np.random.default_rng(1)
-    starts = [off(t, plain[t.obj_id], rng) for t in scene.truth]
+    starts = [off(t, scene.models[t.obj_id], rng) for t in scene.truth]
     return scene, starts, register(scene, starts)
 
 

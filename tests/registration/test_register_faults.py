@@ -40,9 +40,7 @@ def anywhere(*which: int) -> list[Wanted]:
 
 
 def run(
-    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
-    config: RegistrationConfig = QUICK,
-    **other: Any,
+    wanted: Sequence[ObjectPose | Wanted] | None, config: RegistrationConfig = QUICK, **other: Any
 ) -> Registration:
     result = register(scene(), wanted, config, **other)
     json.dumps(result.report)
@@ -213,11 +211,8 @@ def test_top_down_needs_starts_and_says_so():
     config = replace(QUICK, method="top-down")
     refused("rough poses", run, None, config=config)
     first = starts()[0]
-    wanted = [
-        Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj),
-        *anywhere(1, 2, 3),
-    ]
-    result = run(wanted, config=config)
+    rough = Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj)
+    result = run([rough, *anywhere(1, 2, 3)], config=config)
     assert [o.instance for o in result.scene.objects] == [0]
     assert {n.instance for n in result.not_placed} == {1, 2, 3}
     assert result.report["method"] == "top-down" and result.seen == {}
@@ -240,5 +235,4 @@ def test_what_cannot_be_registered_is_refused_by_name():
     refused("'best'; joint or top-down", run, starts(), best)
     small = replace(scene().frames[0], depth_m=np.zeros((5, 5), np.float32))
     refused("shape", run, starts(), frames=[small])
-    blind = [without_any_depth(f) for f in scene().frames]
-    refused("all zero", run, starts(), frames=blind)
+    refused("all zero", run, starts(), frames=[without_any_depth(f) for f in scene().frames])

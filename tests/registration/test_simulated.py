@@ -72,8 +72,7 @@ def test_resting_objects_are_stable():
     for o in result.objects:
         v = se3.transform(o.T_world_obj, meshes[o.obj_id].vertices)
         mass = se3.transform(o.T_world_obj, to_trimesh(meshes[o.obj_id]).center_mass[None])[0]
-        foot = v[v[:, 2] < 1e-3, :2]
-        hull = ConvexHull(foot)
+        hull = ConvexHull(v[v[:, 2] < 1e-3, :2])
         beyond = hull.equations[:, :2] @ mass[:2] + hull.equations[:, 2]
         assert beyond.max() < 1e-3, part_models()[o.obj_id].name
 
@@ -95,9 +94,8 @@ def test_a_seed_gives_a_layout_and_what_finds_no_room_is_named():
 
 def test_the_errors_are_those_asked_for_and_stored_consistently():
     scene = scene_of([part("mug").obj_id], replace(TINY, views=600), np.random.default_rng(3))
-    np.testing.assert_allclose(
-        np.stack([f.T_world_cam for f in scene.frames]), scene.Ts_base_ee @ scene.T_ee_cam
-    )
+    claimed = np.stack([f.T_world_cam for f in scene.frames])
+    np.testing.assert_allclose(claimed, scene.Ts_base_ee @ scene.T_ee_cam)
     hand_eye = se3.invert(scene.T_ee_cam) @ scene.T_ee_cam_true
     assert np.linalg.norm(hand_eye[:3, 3]) == pytest.approx(0.5e-3)
     assert np.degrees(se3.angle(hand_eye[:3, :3])) == pytest.approx(0.1)
