@@ -225,8 +225,7 @@ def test_frames_of_another_size_are_named_by_number() -> None:
 
 def test_identical_frames_are_named() -> None:
     refused("identical", fuse, [replace(good()[0], index=k) for k in range(5)])
-    pose = good()[0].T_world_cam
-    refused("same place", fuse, [replace(f, T_world_cam=pose) for f in good()])
+    refused("same place", fuse, [replace(f, T_world_cam=good()[0].T_world_cam) for f in good()])
     refused("unique", fuse, [good()[0], *good()])
 
 
@@ -261,8 +260,6 @@ def test_an_object_that_is_mostly_holes_is_not_accepted() -> None:
 
 # --- Exact depth of things on a table from all around.
 
-TABLE = square(0.6)
-
 
 def exact_frames(
     meshes: tuple[Mesh, ...], camera: CameraIntrinsics, count: int = 12, table: bool = True
@@ -271,7 +268,7 @@ def exact_frames(
 
     The others look from 20 and 55 degrees in turn, so that every side is seen by two.
     """
-    things = (*meshes, TABLE) if table else meshes
+    things = (*meshes, square(0.6)) if table else meshes
     scene = RayScene([PlacedMesh(BACKGROUND, m, np.eye(4)) for m in things])
     rays = ray_table(camera)
     frames: list[FusionFrame] = []

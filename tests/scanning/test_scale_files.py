@@ -91,9 +91,8 @@ def test_a_start_is_two_values(tmp_path):
 
 
 def test_a_start_that_is_none_is_named(tmp_path):
-    scaled = np.diag([2.0, 2, 2, 1]).tolist()
-    with pytest.raises(NotRigidError, match="never inside"):
-        files.load_start(written(tmp_path, scale=2.0, T_world_obj=scaled))
+    path = written(tmp_path, scale=2.0, T_world_obj=np.diag([2.0, 2, 2, 1]).tolist())
+    refused("never inside", files.load_start, path, error=NotRigidError)
     pose = np.eye(4).tolist()
     for scale in (-1, 0, "big", None, True):
         refused("scale", files.load_start, written(tmp_path, scale=scale, T_world_obj=pose))
@@ -158,11 +157,9 @@ def test_a_mesh_has_the_colour_of_its_residual(mug, value, count):
 @pytest.mark.slow
 def test_a_scale_that_is_too_great_is_blue_and_one_too_small_is_red():
     solid = known_scan("bottle", 1)  # without an inside, whose residuals have the other sign
-    great, small = (
-        decoded(residuals_png(solid.scan, fit_of(solid, f), SMALL)) for f in (1.08, 0.92)
-    )
+    pictures = (residuals_png(solid.scan, fit_of(solid, f), SMALL) for f in (1.08, 0.92))
     head, bar = 60, 150  # neither the coloured title nor the colour bar
-    great, small = great[head:, :-bar], small[head:, :-bar]
+    great, small = (decoded(png)[head:, :-bar] for png in pictures)
     assert bluish(great) > 3 * reddish(great)
     assert reddish(small) > 3 * bluish(small)
 

@@ -152,8 +152,7 @@ def test_points_below_the_plane_are_named(mug: Case) -> None:
 @pytest.mark.slow
 def test_nearly_every_part_is_among_the_first_that_are_fitted() -> None:
     ranks = {name: _rank(_case(name, 31)) for name in part_names()[::6]}
-    most = ScaleConfig().search.starts
-    assert np.mean([rank <= most for rank in ranks.values()]) >= 0.9, ranks
+    assert np.mean([rank <= ScaleConfig().search.starts for rank in ranks.values()]) >= 0.9, ranks
 
 
 # --- The table under the object, and which object is meant.
@@ -183,14 +182,10 @@ def table_of(known: Scanned, frames: tuple[DepthFrame, ...] | None = None) -> Su
     return find_table(known.views.intrinsics, frames or known.frames, CONFIG, 0)
 
 
-def object_of(
-    known: Scanned,
-    frames: tuple[DepthFrame, ...] | None = None,
-    at: tuple[float, float] | None = None,
-) -> Footprint:
-    frames = frames or known.frames
+def object_of(known: Scanned, at: tuple[float, float] | None = None) -> Footprint:
+    camera, frames = known.views.intrinsics, known.frames
     noise = measure_noise(frames, EvidenceConfig())
-    return find_object(known.views.intrinsics, frames, table_of(known, frames), noise, CONFIG, at)
+    return find_object(camera, frames, table_of(known), noise, CONFIG, at)
 
 
 def test_the_plane_is_found_whatever_the_world_is():
@@ -214,7 +209,7 @@ def test_several_objects_are_named_with_their_places_and_heights():
     known = two_things()
     said = refused(r"2 objects stand on the table.*--at x,y.*alone", object_of, known)
     named = re.findall(r"x=(-?[\d.]+), y=(-?[\d.]+)[^;]*?(\d+) mm tall", said)
-    found = np.array(named, dtype=float)
+    found = np.array(named, float)
     for where, tall in zip(places(known), (60, 105), strict=True):
         nearest = found[np.argmin(np.linalg.norm(found[:, :2] - where, axis=1))]
         assert np.linalg.norm(nearest[:2] - where) < 0.015
@@ -229,10 +224,8 @@ def test_at_picks_one_of_them_and_nothing_of_the_other():
     middle = se3.transform(plane.T_world_table, found.box.mean(0))[0]
     assert np.linalg.norm(middle[:2] - here) < 0.012
     assert found.box[1, 2] == pytest.approx(0.105, abs=0.010)
-    cell = np.floor(
-        (se3.transform(se3.invert(plane.T_world_table), np.array([*there, 0.0]))[0, :2]
-         - found.origin) / found.cell_m
-    ).astype(int)  # fmt: skip
+    other = se3.transform(se3.invert(plane.T_world_table), np.array([*there, 0.0]))[0, :2]
+    cell = np.floor((other - found.origin) / found.cell_m).astype(int)
     if np.all((cell >= 0) & (cell < found.near.shape)):
         assert not found.near[tuple(cell)] and not found.around[tuple(cell)]
 

@@ -19,8 +19,7 @@ V = CONFIG.verdict
 
 @lru_cache(maxsize=1)
 def right() -> tuple[ScaleState, Outlook, Explained]:
-    shape, evidence = shape_of("bunny"), evidence_of("bunny", "exact")
-    state = true_state(scanned("bunny", "exact"), shape, evidence)
+    shape, evidence, state = truth("bunny")
     state, look = joint_fit(shape, evidence, state, CONFIG)
     return state, look, explain(shape, evidence, state)
 
@@ -36,10 +35,6 @@ def judged(
         look = replace(look, offsets=np.full_like(look.offsets, offsets * size))
     fit = (state, look, replace(explained, **seen))
     return judge(shape_of("bunny"), evidence_of("bunny", "exact"), fit, rivals, (sigma, CONFIG))
-
-
-def given_scale(factor: float) -> float:
-    return right()[0].s * shape_of("bunny").unit * factor
 
 
 def test_a_right_fit_is_accepted_without_reasons():
@@ -78,7 +73,7 @@ def test_a_rival_of_another_scale_that_explains_as_much_raises_doubt():
     for scale, theirs, doubt in (
         (1.2, gain - 0.01, True), (0.8, gain + 0.01, True), (1.2, gain - 0.1, False),
     ):  # fmt: skip
-        j = judged(rivals=((given_scale(scale), theirs),))
+        j = judged(rivals=((right()[0].s * shape_of("bunny").unit * scale, theirs),))
         assert (j.verdict == "doubtful") == doubt
         assert j.checks["contrast"] == pytest.approx(gain - theirs)
         if doubt:
@@ -95,10 +90,8 @@ def test_patches_that_were_hardly_seen_do_not_speak_for_another_object():
     offsets = look.offsets.copy()
     offsets[sigmas > 5 * np.median(look.offset_sigmas)] = 0.2
     spoiled = replace(look, offsets=offsets, offset_sigmas=sigmas)
-    j = judge(
-        shape_of("bunny"), evidence_of("bunny", "exact"), (state, spoiled, explained), (),
-        (0.002, CONFIG),
-    )  # fmt: skip
+    fit = (state, spoiled, explained)
+    j = judge(shape_of("bunny"), evidence_of("bunny", "exact"), fit, (), (0.002, CONFIG))
     assert j.verdict == "accepted"
 
 
