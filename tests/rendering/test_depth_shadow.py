@@ -182,8 +182,6 @@ def test_a_matched_pair_sees_the_same_scene() -> None:
 
 # --- What a depth sensor loses: laws of the causes, and a known loss found again from known views.
 
-KnownView, LossFitConfig = losses.KnownView, losses.LossFitConfig
-fit_losses = losses.fit_losses
 FULL = CameraIntrinsics(width=320, height=240, fx=320, fy=320, cx=159.5, cy=119.5)
 
 
@@ -192,8 +190,8 @@ def grey(value: float, metallic: float = 0.0, roughness: float = 0.8) -> float:
 
 
 def test_darker_and_shinier_materials_lose_more_and_white_paint_next_to_nothing() -> None:
-    losses = [grey(v) for v in (0.9, 0.3, 0.1, 0.03, 0.003)]
-    assert losses == sorted(losses) and losses[0] < 1e-3 < 0.9 < losses[-1]
+    lost = [grey(v) for v in (0.9, 0.3, 0.1, 0.03, 0.003)]
+    assert lost == sorted(lost) and lost[0] < 1e-3 < 0.9 < lost[-1]
     # The threshold itself: half of a surface of that reflectance is lost.
     assert grey(0.03) == pytest.approx(0.5, abs=0.01)
     mirrors = [grey(0.9, 1.0, r) for r in (1.0, 0.6, 0.2, 0.05)]
@@ -228,7 +226,7 @@ def view(model: DepthSensorModel, reflectance: dict[int, float], seed: int) -> A
         labels.depth_m, FULL, np.random.default_rng(seed), scene=scene, T_world_cam=np.eye(4),
         reflectance=rho,
     )  # fmt: skip
-    return KnownView(
+    return losses.KnownView(
         measured_m=measured, exact_m=labels.depth_m, ids=labels.ids,
         kinds={0: "rubber", 1: "paper"}, intrinsics=FULL, scene=scene, T_world_cam=np.eye(4),
     )  # fmt: skip
@@ -244,8 +242,8 @@ PLAIN = replace(
 def test_the_reflectance_of_each_kind_and_what_edges_lose_are_found_again() -> None:
     true = {0: 0.12, 1: 0.8}
     views = [view(PLAIN, true, seed) for seed in (0, 1)]
-    tried = LossFitConfig(edge_width_px=(1, 2, 3), edge_dropout=(0.2, 0.5, 0.8))
-    fit = fit_losses(replace(PLAIN, edge_width_px=1, edge_dropout=0.2), views, tried)
+    tried = losses.LossFitConfig(edge_width_px=(1, 2, 3), edge_dropout=(0.2, 0.5, 0.8))
+    fit = losses.fit_losses(replace(PLAIN, edge_width_px=1, edge_dropout=0.2), views, tried)
     assert fit.reflectance["rubber"] == pytest.approx(0.12, rel=0.15)
     assert fit.share_by_kind["rubber"] > 0.5 and fit.share_by_kind["paper"] < 0.05
     # Narrow edges that lose nearly all and wider ones that lose half leave as many holes.
@@ -263,8 +261,8 @@ def test_the_reflectance_of_each_kind_and_what_edges_lose_are_found_again() -> N
 
 
 def test_a_kind_that_was_not_seen_gets_the_mean_of_all() -> None:
-    fit = fit_losses(PLAIN, [view(PLAIN, {0: 0.12, 1: 0.8}, 0)],
-                     LossFitConfig(edge_width_px=(2,), edge_dropout=(0.5,)))  # fmt: skip
+    tried = losses.LossFitConfig(edge_width_px=(2,), edge_dropout=(0.5,))
+    fit = losses.fit_losses(PLAIN, [view(PLAIN, {0: 0.12, 1: 0.8}, 0)], tried)
     low, high = sorted(fit.reflectance.values())
     assert low < fit.mean_reflectance < high
     unknown = replace(view(PLAIN, {}, 1), kinds={0: "cup"})
@@ -274,7 +272,8 @@ def test_a_kind_that_was_not_seen_gets_the_mean_of_all() -> None:
 
 
 def test_mistakes_are_named() -> None:
-    refused("found none", fit_losses, PLAIN, [])
+    refused("found none", losses.fit_losses, PLAIN, [])
     empty = view(PLAIN, {}, 0)
-    refused("found none", fit_losses, PLAIN, [replace(empty, ids=np.full_like(empty.ids, -1))])
+    nothing = replace(empty, ids=np.full_like(empty.ids, -1))
+    refused("found none", losses.fit_losses, PLAIN, [nothing])
     refused("320x240", replace, empty, measured_m=empty.measured_m[:100])

@@ -39,9 +39,11 @@ def light_of(
     return PhotoRenderer(placed, SHARP, sky, how).radiance(intrinsics, T)[0]
 
 
-def pixel_of(x: float, y: float, T: np.ndarray = ABOVE) -> tuple[int, int]:
-    """Row and column where the wide camera sees a place of the table."""
-    u, v = np.round(camera.project(WIDE, se3.transform(se3.invert(T), [[x, y, 0]]))[0])
+def pixel_of(
+    x: float, y: float, T: np.ndarray = ABOVE, lens: CameraIntrinsics = WIDE
+) -> tuple[int, int]:
+    """Row and column where a camera sees a place of the table."""
+    u, v = np.round(camera.project(lens, se3.transform(se3.invert(T), [[x, y, 0]]))[0])
     return int(v), int(u)
 
 
@@ -256,9 +258,7 @@ def lit(mesh: Mesh, material: Material | None, sky: Environment | None = WHITE_S
 
 
 def at(picture: np.ndarray, x: float, y: float, T: np.ndarray = OVER) -> np.ndarray:
-    uv = camera.project(LENS_VIEW, se3.transform(se3.invert(T), [[x, y, 0]]))[0]
-    u, v = np.round(uv).astype(int)
-    return picture[v, u]
+    return picture[pixel_of(x, y, T, LENS_VIEW)]
 
 
 def four_colors() -> np.ndarray:

@@ -187,10 +187,6 @@ def test_what_stops_a_configuration_is_named():
     assert space_of(obstacles).blame(READY[None], np.array([0.08]), with_hand=True)[0] == 7
 
 
-def test_clearances_that_cannot_be_checked_are_refused():
-    refused("clearances", ArmSpaceConfig, clearance_m=0.0)
-
-
 # --- An arm with a hand: kinematics both ways, how far it reaches, and its URDF.
 FOUR_ARMS = ("panda", "ur5", "iiwa14", "xarm6")
 
@@ -387,6 +383,7 @@ def test_a_rounded_path_is_used_only_where_it_is_free_and_is_quicker():
     assert np.linalg.norm(stopping[:, None] - legs, axis=2).min(axis=1).max() < 0.002
 
 
-def test_timings_that_make_no_sense_are_refused():
+def test_timings_and_clearances_that_make_no_sense_are_refused():
+    refused("clearances", ArmSpaceConfig, clearance_m=0.0)
     for wrong in ({"velocity_share": 0.0}, {"acceleration_share": 1.5}, {"sample_hz": 0.0}):
         refused(".", TimingConfig, **wrong)
