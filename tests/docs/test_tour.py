@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from documents import ROOT, blocks, prose
 from played import play, read, run
 from printed import agrees
+
+from documents import ROOT, blocks, prose
 
 TOUR = (ROOT / "docs/tour/README.md", *sorted((ROOT / "docs/tour").glob("[0-9]*.md")))
 API = sorted((ROOT / "docs/api").glob("*.md"))
