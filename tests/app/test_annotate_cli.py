@@ -30,6 +30,10 @@ def run(store: SessionStore, *options: str) -> Result:
     return finished("annotate", store.folder, "--quiet", *options)
 
 
+def page_of(store: SessionStore) -> str:
+    return store.path(PAGE_FILE).read_text("utf-8")
+
+
 def test_it_tells_of_every_object_and_draws_the_frames(store: SessionStore) -> None:
     said = run(store, "--maps", "all").output
     for words in ("4 views annotated (0 still held)", *(m.name for m in MODELS.values())):
@@ -42,7 +46,13 @@ def test_it_tells_of_every_object_and_draws_the_frames(store: SessionStore) -> N
     assert "4 views annotated (4 still held)" in told
     assert store.path(PAGE_FILE).read_bytes() == page
     assert str(store.path(PAGE_FILE)) in told.replace("\n", "")
-    the_page_shows_photographs_maps_objects_and_the_registration(store)
+    text = page_of(store)
+    titles = ["Photographs and labels", "Objects", "Maps", "Before and after registration"]
+    assert re.findall(r"<h2>(.*?)</h2>", text) == titles
+    layers = re.findall(r'data-layer="(.*?)"', text)
+    assert set(layers) == {"photo", "instances", "exact depth", "object coordinates", "normals"}
+    assert all(m.name in text for m in MODELS.values())
+    assert "http" not in re.sub(r"http://www\.w3\.org\S*", "", text)  # nothing is fetched
 
 
 def test_a_hand_before_an_object_is_told_and_can_be_switched_off(store: SessionStore) -> None:
@@ -64,20 +74,6 @@ def test_a_hand_before_an_object_is_told_and_can_be_switched_off(store: SessionS
 def test_an_unknown_map_is_named(store: SessionStore) -> None:
     assert "no map 'colour'" in refused("annotate", store.folder, "--maps", "colour")
     assert not store.has("scene_gt_coco.json")
-
-
-def page_of(store: SessionStore) -> str:
-    return store.path(PAGE_FILE).read_text("utf-8")
-
-
-def the_page_shows_photographs_maps_objects_and_the_registration(store: SessionStore) -> None:
-    page = page_of(store)
-    titles = ["Photographs and labels", "Objects", "Maps", "Before and after registration"]
-    assert re.findall(r"<h2>(.*?)</h2>", page) == titles
-    layers = re.findall(r'data-layer="(.*?)"', page)
-    assert set(layers) == {"photo", "instances", "exact depth", "object coordinates", "normals"}
-    assert all(m.name in page for m in MODELS.values())
-    assert "http" not in re.sub(r"http://www\.w3\.org\S*", "", page)  # nothing is fetched
 
 
 def captions_of(store: SessionStore) -> list[str]:

@@ -3,11 +3,12 @@
 import json
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from played import play, read, run
+from played import ENVIRONMENT, play, read, run
 from printed import agrees
 
 from documents import ROOT, blocks, prose
@@ -102,3 +103,33 @@ def test_an_arm_that_is_not_in_the_package_is_proven_planned_for_and_captured_wi
     assert header["extra"]["arm"] == "SixJoint"
     plan = json.loads((tmp_path / "own.json").read_text())["content"]
     assert plan["robot"] == "SixJoint" and plan["metrics"]["colliding_legs"] == 0
+
+
+# --- Sphinx builds the pages without a warning, from what is here alone
+
+NO_NETWORK = """
+import socket, sys
+def refuse(*args, **kwargs):
+    raise OSError("the documentation is built without a network")
+socket.socket.connect = socket.create_connection = refuse
+from sphinx.cmd.build import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+def test_the_pages_are_built_with_warnings_as_errors(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [
+            sys.executable, "-c", NO_NETWORK, "-q", "-W", "--keep-going", "-b", "html",
+            "-d", str(tmp_path / "read"), str(ROOT / "docs"), str(tmp_path / "site"),
+        ],
+        capture_output=True, text=True, timeout=1200,
+        env=ENVIRONMENT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-6000:]
+    site = tmp_path / "site"
+    for page in ("index", "tour/05-school", "api/store", "how-to/import-bop"):
+        assert (site / f"{page}.html").is_file()
+    assert "SessionStore.open" in read(site / "api/store.html")
+    assert not (ROOT / "docs/_build").exists()
