@@ -26,6 +26,7 @@ from realsim.app.options import two_meanings
 from stored_sessions import flip, make_whole
 from typed_commands import complained, realsim, started, wait_until
 
+MAIN = "from realsim.app.cli import main; main()"
 HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
 
@@ -101,8 +102,7 @@ def test_130_is_interrupted(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:
-    code = "from realsim.app.cli import main; main()"
-    script = f"{sys.executable} -c '{code}' config template | head -1; exit ${{PIPESTATUS[0]}}"
+    script = f"{sys.executable} -c '{MAIN}' config template | head -1; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=100)
     assert done.returncode in (0, 141) and done.stderr == ""
     assert done.stdout.startswith("# Settings")
@@ -298,7 +298,6 @@ def test_what_is_missing_ends_with_what_to_install_and_a_bug_with_its_place(
 
 # --- output that nobody wants (`>&-`, `2>&-`, a reader that has gone) -----------------------------
 
-MAIN = "from realsim.app.cli import main; main()"
 CLOSED = "<&- >&- 2>&-"
 
 

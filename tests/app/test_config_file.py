@@ -43,12 +43,8 @@ def read(text: str) -> dict[str, Any]:
     return settings_of(commands, read_config(written(text), "", is_named=True))
 
 
-def show(*args: str) -> dict[str, Any]:
-    return json.loads(finished(*args, "--json").stdout)
-
-
 def in_force(command: str, option: str, *before: str) -> tuple[Any, str]:
-    told = show(*before, "config", "show", *command.split())
+    told = json.loads(finished(*before, "config", "show", *command.split(), "--json").stdout)
     (row,) = [o for o in told["options"] if (o["command"], o["option"]) == (command, option)]
     return row["value"], row["origin"]
 

@@ -52,20 +52,14 @@ def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
     assert seen > 1000
     assert twin.figures.mask_iou == twin.figures.mask_iou_least == 1.0
     assert 0.5 < twin.figures.noise_ratio < 2.0
-    light_and_table_match_the_photographs(real, twin)
-    the_result_is_a_sound_session_with_sheet_and_page(real, twin)
-
-
-def light_and_table_match_the_photographs(real, twin):
+    # Light and table match the photographs.
     look = twin.look.look
     assert look.has_colors
     assert look.object_error < 0.02 and look.table_error < 0.02
     for made, shot in enumerate(twin.real):
         ours, theirs = (light_of_bytes(s.rgb(k)) for s, k in ((twin.twin, made), (real, shot)))
         assert np.abs(ours.mean((0, 1)) - theirs.mean((0, 1))).max() < 0.05
-
-
-def the_result_is_a_sound_session_with_sheet_and_page(real, twin):
+    # The result is a sound session with sheet and page.
     assert twin.twin.folder == real.folder / "synthetic/real-embedded-disparity"
     assert twin.twin.verify() == []
     assert twin.sheet.is_file() and b"<html" in twin.page.read_bytes()[:200].lower()

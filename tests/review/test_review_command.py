@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,9 +14,7 @@ from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.server import counted
 from realsim.store import SessionStore
 from reviewed_boxes import boxes_session
-from typed_commands import refused
-
-MAIN = "from realsim.app.cli import main; main()"
+from typed_commands import refused, started
 
 
 def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_path: Path) -> None:
@@ -36,11 +33,9 @@ def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
     folder = boxes_session(tmp_path / "boxes").folder
     (folder / "review").mkdir()
     (folder / "review/journal.jsonl").write_text('{"format": 2, "id\n')
-    words = [sys.executable, "-c", MAIN, "review", folder, "--port=0", "--no-browser", "--json"]
-    process = subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    at_once = {"env": os.environ | {"PYTHONUNBUFFERED": "1"}}
+    process = started("review", folder, "--port=0", "--no-browser", "--json", **pipes, **at_once)
     assert process.stderr is not None
     assert "line 1 of" in process.stderr.readline()
     assert "http://127.0.0.1:" in process.stderr.readline()
