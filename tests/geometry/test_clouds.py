@@ -1,5 +1,7 @@
 """Depth images to points, voxel means, planes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,8 @@ from realsim.geometry.depth import depth_noise_per_m, edge_mask, points_from_dep
 from realsim.records import CameraIntrinsics
 from refusals import refused
 
-CAMERA = CameraIntrinsics(
-    width=80, height=60, fx=70.0, fy=72.0, cx=39.0, cy=30.5, distortion=np.array([0.05, -0.02])
-)
 PINHOLE = CameraIntrinsics(width=80, height=60, fx=70.0, fy=72.0, cx=39.0, cy=30.5)
+CAMERA = replace(PINHOLE, distortion=np.array([0.05, -0.02]))
 
 
 def tilted_plane_depth(camera: CameraIntrinsics) -> np.ndarray:
@@ -85,8 +85,7 @@ def test_plane_is_found_among_outliers_and_moves_with_the_world():
     normal, offset, inliers = fit_plane_ransac(points, rng, 0.002)
     assert abs(normal @ T[:3, 2]) > np.cos(np.radians(0.05))
     assert inliers[:2000].mean() > 0.99
-    T_world_table = plane_frame(normal, offset, points[inliers])
-    local = se3.transform(se3.invert(T_world_table), points[:2000])
+    local = se3.transform(se3.invert(plane_frame(normal, offset, points[inliers])), points[:2000])
     assert abs(local[:, 2].mean()) < 1e-4
     assert np.linalg.norm(local.mean(0)) < 0.03
 

@@ -38,11 +38,8 @@ def ball(radius: float, center: np.ndarray) -> ObjectModel:
 
 
 def small_motion(rng: np.random.Generator, deg: float = 3.0, mm: float = 3.0) -> np.ndarray:
-    return se3.exp(
-        np.concatenate(
-            [np.radians(deg) * rng.standard_normal(3), mm / 1e3 * rng.standard_normal(3)]
-        )
-    )
+    turn = np.radians(deg) * rng.standard_normal(3)
+    return se3.exp(np.concatenate([turn, mm / 1e3 * rng.standard_normal(3)]))
 
 
 @pytest.mark.parametrize("name", ["cube", "gear", "bowl", "mug"])
@@ -93,9 +90,8 @@ def test_known_answers_of_a_cylinder():
     upright = v + np.array([0, 0, 0.02])
     assert nearest_symmetry(np.eye(4), flip, upright, None, axis).distance_m > 0.039
     both = np.stack([np.eye(4), flip])
-    assert nearest_symmetry(np.eye(4), turned @ flip, v, both, axis).distance_m == pytest.approx(
-        0.005, rel=1e-6
-    )
+    near = nearest_symmetry(np.eye(4), turned @ flip, v, both, axis)
+    assert near.distance_m == pytest.approx(0.005, rel=1e-6)
 
 
 def test_an_axis_off_the_origin_turns_about_its_own_point():
@@ -150,11 +146,9 @@ def test_errors_belong_to_the_pair_of_poses_not_to_the_frame_or_the_symmetric_tw
         assert metrics.mssd_symmetric(T, E @ S, model) == rough
         assert metrics.mssd_symmetric(T @ S, E, model) == rough
         assert metrics.mssd_symmetric(E, T, model) == rough
-        near = metrics.aligned_pose(T, E, model)
-        assert metrics.mssd(T, near, model.mesh.vertices) == rough
-        assert metrics.add_s(C @ T, C @ E, model) == pytest.approx(
-            metrics.add_s(T, E, model), rel=1e-3
-        )
+        assert metrics.mssd(T, metrics.aligned_pose(T, E, model), model.mesh.vertices) == rough
+        expected = pytest.approx(metrics.add_s(T, E, model), rel=1e-3)
+        assert metrics.add_s(C @ T, C @ E, model) == expected
 
 
 def test_without_axes_it_is_the_mssd_of_the_list_and_never_more_than_without_symmetry():
@@ -190,8 +184,7 @@ def test_add_s_has_no_floor_and_is_the_distance_of_parallel_faces():
     push = 0.001 * np.eye(3)[k]
     pushed = metrics.add_s(T, T @ se3.from_translation(push), model)
     normals = sample_surface(model.mesh, 20000, np.random.default_rng(1))[1]
-    ends = float(np.mean(np.abs(normals[:, k])))
-    assert pushed == pytest.approx(0.001 * ends, rel=0.1)
+    assert pushed == pytest.approx(0.001 * float(np.mean(np.abs(normals[:, k]))), rel=0.1)
     assert pushed <= metrics.mssd_symmetric(T, T @ se3.from_translation(push), model)
 
 

@@ -64,12 +64,11 @@ def test_the_compiled_chain_says_what_the_other_says(name: str) -> None:
         np.testing.assert_allclose(J[3:, i], (ends[1] - ends[0])[:3, 3] / 2e-6, atol=1e-8)
     # Followed lines end where they should, for whatever number of joints.
     T = arm.chain.forward(arm.home) @ T_tool
-    path, _, worst = follow_lines(
-        numbers, arm.home[None], T[None], np.array([[0.0, 0.0, 1.0]]), np.linspace(0, 0.05, 4)
-    )
+    up, far = np.array([[0.0, 0.0, 1.0]]), np.linspace(0, 0.05, 4)
+    path, _, worst = follow_lines(numbers, arm.home[None], T[None], up, far)
     assert worst[0] < 1e-9
     rise = (arm.chain.forward(path[0]) @ T_tool)[:, 2, 3] - T[2, 3]
-    np.testing.assert_allclose(rise, np.linspace(0, 0.05, 4), atol=1e-9)
+    np.testing.assert_allclose(rise, far, atol=1e-9)
 
 
 # --- an arm of one's own, and its mistakes --------------------------------------------------------
@@ -114,9 +113,8 @@ def six_joints(folder: Path) -> Path:
         for i in range(6)
     )
     folder.mkdir(parents=True)
-    (folder / "six.urdf").write_text(
-        SIX.format(links=links + '<link name="flange"/>', joints=joints)
-    )
+    links += '<link name="flange"/>'
+    (folder / "six.urdf").write_text(SIX.format(links=links, joints=joints))
     (folder / "robot.toml").write_text(TOML)
     return folder
 
@@ -160,12 +158,8 @@ def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
     base = '<body name="base"><geom type="box" size=".05 .05 .05"/>'
     xml = f"<mujoco><worldbody>{base}{text}</body></worldbody></mujoco>"
     (folder / "six.xml").write_text(xml)
-    toml = (
-        TOML.replace("[urdf]", "[mjcf]")
-        .replace("six.urdf", "six.xml")
-        .replace('"flange"', '"face"')
-    )
-    toml += "speed_rad_s = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]\n"
+    toml = TOML.replace("[urdf]", "[mjcf]").replace("six.urdf", "six.xml")
+    toml = toml.replace('"flange"', '"face"') + f"speed_rad_s = {[2.0] * 6}\n"
     (folder / "robot.toml").write_text(toml)
     of_mjcf = find_arm(str(folder))
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
@@ -207,9 +201,7 @@ def test_what_is_wrong_with_an_arm_is_named(
 def test_a_description_that_can_be_read_and_is_wrong_is_told(tmp_path: Path) -> None:
     folder = six_joints(tmp_path / "wrong")
     text = (folder / "six.urdf").read_text().replace('velocity="2"', 'velocity="120"')
-    (folder / "six.urdf").write_text(
-        text.replace('<sphere radius="0.03"/>', '<sphere radius="0.4"/>')
-    )
+    (folder / "six.urdf").write_text(text.replace(BALL, '<sphere radius="0.4"/>'))
     wrong = {f.what for f in check_arm(str(folder))[1] if not f.is_right}
     assert {"joint speeds", "self-collision at home"} <= wrong
 

@@ -79,9 +79,8 @@ def test_pads_that_never_meet_are_named_with_the_gap(tmp_path):
     (tmp_path / "robot.toml").write_text(text)
     hand, findings = check_hand(str(tmp_path))
     assert all(f.is_right for f in findings) and hand.name == tmp_path.name
-    (tmp_path / "robot.toml").write_text(
-        text + "[[finger]]\nlow_m = [-0.01, -0.004, -0.03]\nhigh_m = [0.01, 0.01, 0.01]\n"
-    )
+    finger = "[[finger]]\nlow_m = [-0.01, -0.004, -0.03]\nhigh_m = [0.01, 0.01, 0.01]\n"
+    (tmp_path / "robot.toml").write_text(text + finger)
     wrong = [f for f in check_hand(str(tmp_path))[1] if not f.is_right]
     assert [f.what for f in wrong] == ["pads meet"] and "8.0 mm inside" in wrong[0].found
 
@@ -117,10 +116,8 @@ def test_bars_of_a_linkage_are_inside_their_boxes():
     """Points of the 2F-85's knuckles, turned with the crank, stay in the boxes at every opening."""
     hand = find_hand("robotiq_2f85")
     w = np.linspace(0.0, hand.max_opening_m, 40)
-    crank = np.arctan2(
-        hand.z_pad(w) + np.sqrt(hand.arc_radius_m**2 - hand.arc_axis_y_m**2),
-        w / 2 - hand.arc_axis_y_m,
-    )
+    z = hand.z_pad(w) + np.sqrt(hand.arc_radius_m**2 - hand.arc_axis_y_m**2)
+    crank = np.arctan2(z, w / 2 - hand.arc_axis_y_m)
     boxes = hand.bar_boxes(w)[:, len(hand.bars) :]
     for k, bar in enumerate(hand.bars):
         pivot = np.array(bar[:2])
