@@ -31,10 +31,8 @@ from table_scenes import SMALL_LAB, bodies_of, errors_mm, named_scene, scene_of,
 
 DISPARITY_PER_M = 648 * 0.018
 """Focal length [px] times baseline [m]: pixels of disparity per inverse depth."""
-ALL_POINTS = RefineConfig(
-    early_share=1.0,
-    points=PointConfig(points_per_object=10_000_000, table_points_per_view=1_000_000),
-)
+EVERY = PointConfig(points_per_object=10_000_000, table_points_per_view=1_000_000)
+ALL_POINTS = RefineConfig(early_share=1.0, points=EVERY)
 """Nothing is thinned out: which points are left out depends on their order."""
 NO_NOISE = replace(SMALL_LAB, sensor=DepthSensorModel.noiseless(), arm_mm=0.0, arm_deg=0.0)
 

@@ -87,10 +87,8 @@ class OnePoint:
         assert kernels[0] == pytest.approx(1.0)
         H = H + np.swapaxes(np.triu(H, 1), 1, 2)
         own, rows = (TABLE_AT, TABLE_ROWS) if self.of_table else (object_at(0), tuple(range(6)))
-        blocks = Blocks(
-            H=H, b=b, Ms=se3.from_translation(-center) @ M, own=own, rows=rows,
-            common=self.state.common,
-        )  # fmt: skip
+        Ms, common = se3.from_translation(-center) @ M, self.state.common
+        blocks = Blocks(H=H, b=b, Ms=Ms, own=own, rows=rows, common=common)
         n = self.state.views.shape[1]
         system = assemble([blocks], OBJECTS + 6 * len(self.bodies), n)
         return -system.a / TINY_M, -system.d[0] / TINY_M

@@ -219,10 +219,8 @@ def scene():
 
 
 def registered(scene, *starts, **other):
-    near = [
-        replace(t, T_world_obj=t.T_world_obj @ se3.exp([0.02, 0, 0.03, 0.003, -0.002, 0.002]))
-        for t in scene.truth
-    ]
+    step = se3.exp([0.02, 0, 0.03, 0.003, -0.002, 0.002])
+    near = [replace(t, T_world_obj=t.T_world_obj @ step) for t in scene.truth]
     return register(scene, [*near, *starts], **other)
 
 

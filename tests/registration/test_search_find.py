@@ -79,10 +79,8 @@ def evidence() -> tuple[Any, ...]:
 
 
 def find(wanted: list[Wanted] | None, folder: Path, told: list[str] | None = None) -> SearchResult:
-    return find_objects(
-        *evidence(), scene().models, wanted, CONFIG,
-        field_folder=folder, told=None if told is None else told.append,
-    )  # fmt: skip
+    tell = None if told is None else told.append
+    return find_objects(*evidence(), scene().models, wanted, CONFIG, field_folder=folder, told=tell)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +93,8 @@ def nearest_errors(result: SearchResult) -> list[float]:
     errors: list[float] = []
     for p in scene().truth:
         same = make_sameness(scene().models[p.obj_id])
-        errors.append(
-            min([same.distance(p.T_world_obj, q.T_world_obj)
-                 for q in result.placed if q.obj_id == p.obj_id], default=np.inf)
-        )  # fmt: skip
+        own = [q.T_world_obj for q in result.placed if q.obj_id == p.obj_id]
+        errors.append(min([same.distance(p.T_world_obj, T) for T in own], default=np.inf))
     return errors
 
 

@@ -211,10 +211,8 @@ def test_the_lid_of_a_large_box_is_not_the_table():
     table = sheet(0.0, 0.3, 4000, rng)
     table = table[np.abs(table[:, :2]).max(1) > 0.17][:1800]
     points = np.concatenate([lid, table]) + rng.normal(0, 3e-4, (2500 + len(table), 3))
-    views = [
-        view_of_points(k, (0.3 * np.cos(a), 0.3 * np.sin(a), 0.6), points)
-        for k, a in enumerate(np.arange(6.0))
-    ]
+    eyes = [(0.3 * np.cos(a), 0.3 * np.sin(a), 0.6) for a in range(6)]
+    views = [view_of_points(k, eye, points) for k, eye in enumerate(eyes)]
     plane = find_table(views, NOISE).plane
     assert plane is not None and abs(plane.T_world_table[2, 3]) < 0.002
 

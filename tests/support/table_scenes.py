@@ -82,11 +82,9 @@ def true_cameras(scene: TableScene) -> TableScene:
 
 def things_of(scene: Any) -> list[PlacedMesh]:
     """Return the objects where they really stand, and the table, for a renderer."""
-    table = PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4))
-    return [
-        *(PlacedMesh(p.instance, scene.models[p.obj_id].mesh, p.T_world_obj) for p in scene.truth),
-        table,
-    ]
+    meshes = {i: m.mesh for i, m in scene.models.items()}
+    objects = [PlacedMesh(p.instance, meshes[p.obj_id], p.T_world_obj) for p in scene.truth]
+    return [*objects, PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4))]
 
 
 def true_poses(scene: Any) -> list[Array]:
@@ -102,9 +100,8 @@ def bodies_of(scene: Any, cells: int = 64, samples: int = 200) -> list[Body]:
 def body_at(model: ObjectModel, cells: int, samples: int, T_world_obj: Any = None) -> Body:
     """Return an object at a pose, or at the origin, for a fit."""
     T = np.eye(4) if T_world_obj is None else T_world_obj
-    return make_body(
-        ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T), model, cells, samples
-    )
+    pose = ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)
+    return make_body(pose, model, cells, samples)
 
 
 def views_of(scene: Any, noise: DepthNoise = NOISE, **config: Any) -> tuple[ViewPoints, ...]:
