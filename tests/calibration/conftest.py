@@ -16,10 +16,8 @@ from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewRep
 from realsim_calibration.views import BoardView, TargetDetection
 
 FACTORY = CameraIntrinsics(width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5)
-TRUE_LENS = CameraIntrinsics(
-    width=1280, height=720, fx=644.0, fy=643.0, cx=643.0, cy=356.0,
-    distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 0, 0, 0, 0]),
-)  # fmt: skip
+DISTORTION = np.array([-0.05, 0.04, 6e-4, -4e-4, 0, 0, 0, 0])
+TRUE_LENS = replace(FACTORY, fx=644.0, fy=643.0, cx=643.0, cy=356.0, distortion=DISTORTION)
 
 
 def camera_at(
@@ -130,10 +128,9 @@ def record_views(rng: np.random.Generator, n: int) -> tuple[ViewReport, ...]:
 def record_maps(rng: np.random.Generator) -> tuple[RobotErrorMap | ArmErrorMap | None, ...]:
     rows = rng.normal(size=(4, 6))
     arm = DhArm(name="ur5", a=rows[0], d=rows[1], alpha=rows[2], delta_theta=rows[3] * 1e-3)
-    pose = RobotErrorMap(
-        frame="base", mean=rng.normal(size=12), sd_m=0.1, weights=rng.normal(size=(6, 12)) * 1e-4,
-        reach=rng.normal(size=(9, 12)),
-    )  # fmt: skip
+    mean, weights = rng.normal(size=12), rng.normal(size=(6, 12)) * 1e-4
+    reach = rng.normal(size=(9, 12))
+    pose = RobotErrorMap(frame="base", mean=mean, sd_m=0.1, weights=weights, reach=reach)
     errors, tool = rng.normal(size=24) * 1e-3, se3.random_transform(rng)
     return pose, None, ArmErrorMap(arm=arm, errors=errors, T_flange_tool=tool)
 
@@ -148,10 +145,8 @@ def record(
         M = rng.normal(size=(n, n)) * scale
         return M @ M.T
 
-    lens = CameraIntrinsics(
-        width=1280, height=720, fx=644.1, fy=643.2, cx=643.3, cy=356.4,
-        distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 1e-17, 0, 0, 0]),
-    )  # fmt: skip
+    terms = DISTORTION + 1e-17 * np.eye(8)[4]
+    lens = replace(FACTORY, fx=644.1, fy=643.2, cx=643.3, cy=356.4, distortion=terms)
     return HandEyeReport(
         mode=mode, target=target or TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01),
         X=X_alone @ se3.exp(rng.normal(size=6) * 1e-3), X_covariance=covariance(6, 1e-4),

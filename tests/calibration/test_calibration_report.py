@@ -175,9 +175,8 @@ def test_a_report_of_dropped_views_is_written(report: HandEyeReport, tmp_path: P
                             point_ids=v.point_ids[:0], label=ODD_NAME,
                             seen_px=nan, unseen_px=nan, robot_error=e) for v in report.views[:4]
     )  # fmt: skip
-    bare = replace(
-        report, seen_px=nan, held_out_px=nan, held_out_mm=nan, held_out_deg=nan, views=dropped
-    )
+    unknown = dict.fromkeys(("seen_px", "held_out_px", "held_out_mm", "held_out_deg"), nan)
+    bare = replace(report, views=dropped, **unknown)
     paths = write_calibration_report(bare, tmp_path, images=lambda index: None)
     shown = " ".join(outline(paths[0]).words)
     assert not re.search(r"\bnan\b", shown)

@@ -19,10 +19,8 @@ CAMERA = CameraIntrinsics(
 
 
 def same(a, b):
-    return (
-        (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
-        and a.distortion.tolist() == b.distortion.tolist()
-    )  # fmt: skip
+    one, other = ((c.width, c.height, c.K.tolist(), c.distortion.tolist()) for c in (a, b))
+    return one == other
 
 
 def given_file(folder, name, content):

@@ -77,10 +77,8 @@ def lab(
     rng = np.random.default_rng([seed, 5])
     true = hands(rng, views)
     told = true @ se3.exp(rng.normal(scale=robot, size=(views, 6)))
-    boards = (
-        RigBoard(name="table", target=TABLE),
-        RigBoard(name="held", target=HELD, place="hand"),
-    )
+    table = RigBoard(name="table", target=TABLE)
+    boards = (table, RigBoard(name="held", target=HELD, place="hand"))
     if moved:
         boards = (RigBoard(name="moved", target=TABLE, place="free"),)
     sightings: list[Sighting] = []
@@ -162,9 +160,8 @@ def test_the_step_is_that_of_all_unknowns_solved_at_once() -> None:
     rig = lab(views=6, moved=True)
     loose = {(0, i): PLACES["left"] @ T for i, T in _boards_by(rig, 1).items()}
     rig = rig.only([s for s in rig.sightings if (0, s.instant) in loose])
-    problem = RigProblem(
-        rig, [FACTORY] * 3, [JointConfig()] * 3, np.ones(len(rig.instants), dtype=bool)
-    )
+    all_known = np.ones(len(rig.instants), dtype=bool)
+    problem = RigProblem(rig, [FACTORY] * 3, [JointConfig()] * 3, all_known)
     A = np.stack([t.T_base_ee for t in rig.instants if t.T_base_ee is not None])
     eyes = np.stack([PLACES[n] for n in ("wrist", "left", "right")])
     state = first_state(eyes, np.eye(4)[None], [FACTORY] * 3, A, loose)

@@ -136,10 +136,8 @@ def named_and_repaired(fault):
     assert d.sentence and d.advice
     assert d.labels == tuple(str(k) for k in d.views)
     if fault in REPAIRED:
-        again = diagnose(
-            d.repaired_base_ee, d.repaired_cam_board, target=faults.BOARD,
-            mode="eye_in_hand" if s.eye_in_hand else "eye_to_hand",
-        )  # fmt: skip
+        mode = "eye_in_hand" if s.eye_in_hand else "eye_to_hand"
+        again = diagnose(d.repaired_base_ee, d.repaired_cam_board, target=faults.BOARD, mode=mode)
         assert d.note and again.fault == "none", again.sentence
         assert len(d.repaired_rows) == len(d.repaired_base_ee)
     return d

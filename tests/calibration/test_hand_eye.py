@@ -138,9 +138,8 @@ def test_inverted_poses_are_told(simulate):
 
 def test_a_shifted_pairing_is_told(simulate):
     sim = simulate(9)
-    views = [
-        replace(v, T_base_ee=sim.views[(k + 1) % 24].T_base_ee) for k, v in enumerate(sim.views)
-    ]
+    later = [*sim.views[1:], sim.views[0]]
+    views = [replace(v, T_base_ee=w.T_base_ee) for v, w in zip(sim.views, later, strict=True)]
     refused("images 0 to 23 fit the pose 1 earlier", calibrate, sim, views)
 
 

@@ -61,9 +61,8 @@ def test_a_camera_that_stands_still_is_placed_in_the_base(simulate):
     sim = simulate(3, views=14, robot=(0.0, 0.0), pixel=0.0)
     # The same pictures: the hand carries the board, the base carries the camera.
     views = [replace(v, T_base_ee=se3.invert(v.T_base_ee)) for v in sim.views]
-    r = calibrate_hand_eye_report(
-        views, sim.board, sim.intrinsics0, HandEyeConfig(mode="eye_to_hand")
-    )
+    config = HandEyeConfig(mode="eye_to_hand")
+    r = calibrate_hand_eye_report(views, sim.board, sim.intrinsics0, config)
     assert np.abs(se3.log(se3.invert(r.X) @ sim.T_ee_cam)).max() < 1e-5
     assert np.abs(se3.log(se3.invert(r.Z) @ sim.T_base_board)).max() < 1e-5
     with pytest.raises(InputError, match="has no place in the hand"):

@@ -93,9 +93,8 @@ def test_a_view_never_increases_the_covariance(report: HandEyeReport) -> None:
 def test_ranking_does_not_depend_on_the_base_frame(few: HandEyeReport) -> None:
     rng = np.random.default_rng(4)
     plan, B = random_hands(rng, 15), se3.random_transform(rng)
-    moved = replace(
-        few, Z=B @ few.Z, views=tuple(replace(v, T_base_ee=B @ v.T_base_ee) for v in few.views)
-    )
+    views = tuple(replace(v, T_base_ee=B @ v.T_base_ee) for v in few.views)
+    moved = replace(few, Z=B @ few.Z, views=views)
     for function in (rank_next_views, lambda r, T: choose_next_views(r, T, 5)):
         a, b = function(few, plan), function(moved, B @ plan)
         assert [v.plan_index for v in a] == [v.plan_index for v in b]
@@ -218,6 +217,7 @@ def test_moves_are_told_in_words() -> None:
 # ---- Calibration while views are captured: what it says, when it stops; a folder that fills.
 
 FEW_PROPOSALS = ViewLimits(tilts_deg=(0.0, 30.0), azimuths=4, rolls=4, distances_m=(0.4,))
+EASY = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, limits=FEW_PROPOSALS)
 
 
 def solve(
@@ -235,9 +235,8 @@ def live_view(index: int, A: Array, seed: int = 0) -> BoardView:
 
 
 def running(config: LiveConfig | None = None, checks: tuple[Check, ...] = (), **more: Any) -> Any:
-    return LiveCalibration(
-        BOARD, CAMERA, solve=solve, calibration=checks, config=config or LiveConfig(), **more
-    )
+    config = config or LiveConfig()
+    return LiveCalibration(BOARD, CAMERA, solve=solve, calibration=checks, config=config, **more)
 
 
 def fed(live: LiveCalibration, hands: Iterable[Array]) -> Any:
@@ -278,9 +277,8 @@ def test_live_follows_its_advice_to_the_end() -> None:
 
 def test_live_never_stops_on_a_bad_check() -> None:
     bad = Check(name="board scale", verdict="bad", sentence="The board is 5 % off.", advice="Rule.")
-    easy = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, limits=FEW_PROPOSALS)
     hands = random_hands(np.random.default_rng(10), 12)
-    good, spoiled = running(easy), running(easy, checks=(bad,))
+    good, spoiled = running(EASY), running(EASY, checks=(bad,))
     for k, A in enumerate(hands):
         a, b = good.add(live_view(k, A)), spoiled.add(live_view(k, A))
         assert not b.stop
@@ -325,10 +323,7 @@ def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:
     def unsteady(*given: Any) -> HandEyeReport:
         return replace(solve(*given), held_out_px=next(swing))
 
-    config = LiveConfig(
-        sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, least_gain=0.0, limits=FEW_PROPOSALS
-    )
-    live = LiveCalibration(BOARD, CAMERA, solve=unsteady, config=config)
+    live = LiveCalibration(BOARD, CAMERA, solve=unsteady, config=replace(EASY, least_gain=0.0))
     hands = random_hands(np.random.default_rng(16), 13)
     stops = [live.add(live_view(k, A)).stop for k, A in enumerate(hands)]
     # views 6 to 10 swing; with view 12 the last three are 0.3, 0.31, 0.3
@@ -400,8 +395,7 @@ def test_a_folder_is_watched_until_done(tmp_path: Path) -> None:
             raise InputError(f"{pose.name} holds no pose")
         return live_view(index, A)
 
-    live = running(LiveConfig(sigma_mm=100, sigma_deg=10, min_views_to_stop=8, stable_share=2.0,
-                              limits=FEW_PROPOSALS))  # fmt: skip
+    live = running(replace(EASY, min_views_to_stop=8, stable_share=2.0))
 
     def clock() -> float:
         return time[0]

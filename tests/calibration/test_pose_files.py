@@ -167,9 +167,8 @@ def test_units_in_names_extra_columns_and_joints(tmp_path):
     head += ",x (mm),y (mm),z (mm),roll_deg,pitch_deg,yaw_deg,force"
     names = [f"{k}.png" for k in range(8)]
     found = read_pose_file(write_lines(tmp_path / "a.csv", table, ",", names, head=head))
-    assert {str(p) for p in found.possible} == {
-        f"euler_{o},deg,mm{i}" for o in ("xyz", "XYZ") for i in ("", ",inverted")
-    }
+    meant = {f"euler_{o},deg,mm{i}" for o in ("xyz", "XYZ") for i in ("", ",inverted")}
+    assert {str(p) for p in found.possible} == meant
     assert np.allclose(found.joints, np.radians(joints), atol=1e-14)
     assert list(found.labels) == names and any("force" in n for n in found.notes)
     check(found, reading, T)
@@ -235,10 +234,8 @@ def test_ros_poses_and_parts(tmp_path):
     stamped = [{"header": {"seq": k}, "pose": ros(r)} for k, r in enumerate(q)]
     path = tmp_path / "a.yaml"
     path.write_text("---\n".join(json.dumps(s) + "\n" for s in stamped))  # several documents
-    vectors = [
-        {"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()}
-        for r in rows_of(reading_from_text("rotvec,mm"), T)
-    ]
+    rows = rows_of(reading_from_text("rotvec,mm"), T)
+    vectors = [{"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()} for r in rows]
     for file, stated in (
         (path, "quat_xyzw,m"),
         (as_json(tmp_path / "b.json", parts), "matrix,m"),

@@ -164,10 +164,8 @@ def ruler_ticks_mm(ruler, raster: Raster) -> Array:
     low, high = (round(v / pitch) for v in (start - 0.5, start + ruler.length_mm + 0.5))
     dark = 255.0 - profile[low:high]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (dark > 20).astype(int), [0]])))
-    centres = [
-        np.average(np.arange(a, b), weights=dark[a:b])
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
+    ends = zip(edges[::2], edges[1::2], strict=True)
+    centres = [np.average(np.arange(a, b), weights=dark[a:b]) for a, b in ends]
     return (np.array(centres) + low + 0.5) * pitch
 
 
@@ -294,9 +292,8 @@ def test_papers() -> None:
 def test_make_board_writes_sheet_target_and_picture(tmp_path: Path) -> None:
     line = "chessboard:9x6,square=23mm"
     paths = make_board(line, tmp_path / "new", "A4", preview=True, cut_marks=True)
-    assert [p.name for p in paths] == [
-        f"chessboard_9x6_square23mm.{end}" for end in ("pdf", "json", "png")
-    ]
+    names = [f"chessboard_9x6_square23mm.{end}" for end in ("pdf", "json", "png")]
+    assert [p.name for p in paths] == names
     picture = cv2.imread(str(paths[2]), cv2.IMREAD_GRAYSCALE)
     assert picture is not None and max(picture.shape) == 1600
     page = pdfium.PdfDocument(paths[0])[0].render(scale=150 / 72, grayscale=True).to_numpy()

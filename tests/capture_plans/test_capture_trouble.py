@@ -176,10 +176,8 @@ class Person(Operator):
 def lab() -> tuple[SimulatedLab, Sequence[PlacedMesh]]:
     """The lab, and its objects as they stand on a ground of two triangles."""
     made = SimulatedLab(LabConfig(seed=3, n_objects=4, width=640, height=360))
-    objects = [
-        PlacedMesh(o.instance, made.models[o.obj_id].mesh, o.T_world_obj)
-        for o in made.truth.objects
-    ]
+    true = made.truth.objects
+    objects = [PlacedMesh(o.instance, made.models[o.obj_id].mesh, o.T_world_obj) for o in true]
     ground = PlacedMesh(BACKGROUND, square(1.0), se3.from_translation([0.5, 0.0, 0.0]))
     return made, [ground, *objects]
 

@@ -19,10 +19,8 @@ from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import CAMERA_BODIES, d405_mount, plain_bracket
 from refusals import refused
 
-CELL = WorkCell(
-    table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),
-    keep_out=Box(lower=(0.225, -0.15, -np.inf), upper=(0.525, 0.15, 0.12)),
-)
+KEEP_OUT = Box(lower=(0.225, -0.15, -np.inf), upper=(0.525, 0.15, 0.12))
+CELL = WorkCell(table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)), keep_out=KEEP_OUT)
 GOOD = """
 name = "left bracket"
 camera = "D405"
@@ -49,10 +47,8 @@ def text_of(mount: Mount, folder: Path) -> str:
     lines = [lines_of(top), "" if mount.bracket else "bracket = []"]
     for k, piece in enumerate(mount.bracket):
         T = piece.T_frame_shape
-        table = {
-            "kind": piece.kind, "position_m": T[:3, 3].tolist(),
-            "rotation_vector_rad": se3.log_so3(T[:3, :3]).tolist(),
-        }  # fmt: skip
+        turn, at = se3.log_so3(T[:3, :3]).tolist(), T[:3, 3].tolist()
+        table = {"kind": piece.kind, "position_m": at, "rotation_vector_rad": turn}
         if piece.points is None:
             table["size_m"] = list(piece.size_m)
         else:

@@ -140,9 +140,8 @@ def test_the_plan_turns_with_the_scene() -> None:
 
 
 def test_advice_prefers_the_places_that_reach_most() -> None:
-    places = advise(
-        UR5, d405_mount(), PlanConfig(), 8, 0.05, distances_m=(0.4, 0.6), lifts_m=(0.0,)
-    )
+    far = {"distances_m": (0.4, 0.6), "lifts_m": (0.0,)}
+    places = advise(UR5, d405_mount(), PlanConfig(), 8, 0.05, **far)
     assert [p.center[0] for p in places] == [0.4, 0.6]
     assert places[0].reachable_share > places[1].reachable_share
     assert places[0].one_elbow_hole_deg < places[1].one_elbow_hole_deg

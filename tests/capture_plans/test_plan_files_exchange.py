@@ -45,9 +45,8 @@ def write_path(
     """A path file with tool poses; returns its joints [rad]."""
     q = HOME + np.random.default_rng(1).normal(0, 0.4, (12, 6))
     T = chain.forward(q) @ (np.eye(4) if tool is None else tool)
-    poses = [
-        dict(zip("xyzabc", [*(scale * t[:3, 3]), *se3.log_so3(t[:3, :3])], strict=True)) for t in T
-    ]
+    rows = [[*(scale * t[:3, 3]), *se3.log_so3(t[:3, :3])] for t in T]
+    poses = [dict(zip("xyzabc", row, strict=True)) for row in rows]
     joints = (np.degrees(q) if degrees else q).tolist()
     data = {"joints": joints, "cart_pose": poses, "via_points": ["1", "1", *["0"] * 9, "1"]}
     path.write_text(json.dumps(data))
@@ -117,10 +116,8 @@ def test_urscript_drives_the_same_corners_and_nothing_else(tmp_path: Path) -> No
 
 def test_a_seven_joint_plan_goes_out_and_comes_back(tmp_path: Path) -> None:
     arm = find_arm("panda")
-    plan = replace(
-        a_plan(), chain=arm.chain, home=arm.home, vias=(),
-        joints=arm.home + np.random.default_rng(0).normal(0, 0.1, (9, 7)),
-    )  # fmt: skip
+    joints = arm.home + np.random.default_rng(0).normal(0, 0.1, (9, 7))
+    plan = replace(a_plan(), chain=arm.chain, home=arm.home, vias=(), joints=joints)
     save_plan(plan, tmp_path / "p.json")
     assert load_plan(tmp_path / "p.json").content_hash == plan.content_hash
     export_csv(plan, tmp_path / "p.csv")

@@ -87,10 +87,8 @@ def test_opengl_cameras_look_along_minus_z():
 
 
 def run(code):
-    return subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+    command, env = [sys.executable, "-c", code], os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env)
 
 
 def test_open3d_and_pyrealsense2_really_import():

@@ -180,13 +180,12 @@ def outline_row(
         (H[0], b[0], Hd[0], information, right),
     )  # fmt: skip
     w = information[0]
-    offsets = Offsets(
-        coupling=Hd / w, information=information / w, right=right / w, at=np.array([PATCHES])
-    )
+    at, known = np.array([PATCHES]), information / w
+    offsets = Offsets(coupling=Hd / w, information=known, right=right / w, at=at)
+    further = np.array([SIZE, RIM])
     blocks = Blocks(
-        H=symmetric(H) / w, b=b / w, Ms=Ms, own=OBJECT, further=np.array([SIZE, RIM]),
-        offsets=offsets,
-    )  # fmt: skip
+        H=symmetric(H) / w, b=b / w, Ms=Ms, own=OBJECT, further=further, offsets=offsets
+    )
     return row_of(assemble([blocks], SHARED))
 
 
@@ -208,9 +207,8 @@ def test_outline_derivatives_are_the_differences_of_the_distance(lens: float):
         image = (normal, far / (z / 324.0))
         r, J = outline_row(state, T, point, image, distortion)
         assert abs(r) < 1e-7
-        numeric = differences(
-            lambda s, T=T, p=point, i=image: outline_row(s, T, p, i, distortion)[0], state
-        )
+        given = (T, point, image, distortion)
+        numeric = differences(lambda s, given=given: outline_row(s, *given)[0], state)
         numeric[PATCHES] = 1.0  # where the real surface lies outside, so does the outline
         np.testing.assert_allclose(J, numeric, atol=1e-4 + share * np.abs(J).max())
         assert not J[6:OBJECTS].any()
@@ -269,8 +267,7 @@ def test_the_signed_distance_is_zero_at_the_true_outline_within_a_pixel(name: st
     off: list[Array] = []
     for view, uv, height in outline_px(name, "exact"):
         # What lies low over the table has no depth edge: the foot's outline is not measured.
-        d = looked_up(view.rim.distance_px, view, uv[height > 0.015])
-        off.append(d)
+        off.append(looked_up(view.rim.distance_px, view, uv[height > 0.015]))
     d = np.concatenate(off)
     assert len(d) > 500
     assert abs(np.median(d)) < 0.5
@@ -293,8 +290,8 @@ def test_without_noise_points_lie_on_the_object_and_on_the_table():
 
 def test_a_view_that_does_not_see_the_object_is_named():
     known = scanned("block")
-    away = replace(known.frames[3], T_world_cam=known.frames[3].T_world_cam
-                   @ se3.from_rt(se3.exp_so3([0, np.pi, 0]), [0, 0, 0]))  # fmt: skip
+    T = known.frames[3].T_world_cam @ se3.exp([0, np.pi, 0, 0, 0, 0])
+    away = replace(known.frames[3], T_world_cam=T)
     blind = replace(known.frames[5], depth_m=np.zeros_like(known.frames[5].depth_m))
     frames = (*known.frames[:3], away, known.frames[4], blind, *known.frames[6:])
     evidence = gathered(Scanned(known.real, known.scan, replace(known.views, frames=frames)))

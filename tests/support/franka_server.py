@@ -28,9 +28,8 @@ class FrankaServer:
 
     def __init__(self) -> None:
         """Start it at a loopback address that hardly anybody else has, and wait for it."""
-        self.host = (
-            f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(2, 254)}"
-        )
+        numbers = (random.randint(1, 254), random.randint(0, 255), random.randint(2, 254))
+        self.host = "127.{}.{}.{}".format(*numbers)
         self._process: subprocess.Popen[str] = subprocess.Popen(
             [sys.executable, __file__, self.host],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -89,9 +88,8 @@ def _server(words: queue.Queue[list[str]]) -> type:
             if not self.current_motion_id:  # a robot that holds commands no speed
                 state = state.replace(dq_d=(0.0,) * 7, ddq_d=(0.0,) * 7)
             if self.mode is not None:
-                state = state.replace(
-                    robot_mode=self.mode, errors=tuple(i == self.error for i in range(41))
-                )
+                errors = tuple(i == self.error for i in range(41))
+                state = state.replace(robot_mode=self.mode, errors=errors)
             return state
 
         def process_commands(self) -> None:
@@ -128,9 +126,8 @@ def _server(words: queue.Queue[list[str]]) -> type:
             self.mode = mode
             if self.current_motion_id:
                 self.stop_motion(send_preemption_signal=False)
-                BaseCommand.send_response(
-                    self._tcp_socket, RobotCommand.kMove, self.current_motion_id, status
-                )
+                move, motion = RobotCommand.kMove, self.current_motion_id
+                BaseCommand.send_response(self._tcp_socket, move, motion, status)
                 self.reset_current_motion_id()
 
     return Server

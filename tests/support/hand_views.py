@@ -52,10 +52,8 @@ def random_hands(
 
 
 def lens_of(theta: Array) -> CameraIntrinsics:
-    d = np.zeros(8)
-    d[0] = theta[16]
     fx, fy, cx, cy = np.array([648.0, 648.0, 639.5, 359.5]) + theta[12:16]
-    return replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d)
+    return replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=theta[16] * np.eye(8)[0])
 
 
 def predict(theta: Array, A: Array, errors: Array, mode: str, board: Target = BOARD) -> Array:

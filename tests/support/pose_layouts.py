@@ -203,8 +203,7 @@ def npy_stack(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 
 def npz_with_names(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """An npz with poses and image names."""
-    names = save_images(d, shots)
-    np.savez(d / "poses.npz", poses=Ts, images=np.array(names))
+    np.savez(d / "poses.npz", poses=Ts, images=np.array(save_images(d, shots)))
     return d, d, ""
 
 
@@ -249,8 +248,8 @@ def pairs_moveit(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:
 
 def pairs_of_lists(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:
     """Two lists in one json, gripper2base and target2cam."""
-    lists = {"gripper2base": Ts.tolist(), "target2cam": Cs.tolist()}
-    (d / "pairs.json").write_text(json.dumps(lists))
+    text = json.dumps({"gripper2base": Ts.tolist(), "target2cam": Cs.tolist()})
+    (d / "pairs.json").write_text(text)
     return None, d / "pairs.json"
 
 
