@@ -3,13 +3,13 @@
 import multiprocessing
 import re
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 
 @contextmanager
-def below(most_bytes: float) -> Iterator[None]:
+def below(most_bytes: float) -> Generator[None, None, None]:
     """Hold that what Python takes in the block is no more at any time."""
     tracemalloc.start()
     try:
