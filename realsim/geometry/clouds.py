@@ -151,10 +151,14 @@ def plane_frame(normal: ArrayLike, offset: float, points: ArrayLike) -> Array:
     z = z / np.linalg.norm(z)
     centroid = np.asarray(points, dtype=np.float64).reshape(-1, 3).mean(0)
     axis = np.eye(3)[int(np.argmin(np.abs(z)))]
+    return frame_about(z, axis, centroid - (z @ centroid - offset) * z)
+
+
+def frame_about(z: Array, axis: Array, origin: Array) -> Array:
+    """Return a pose (4, 4) whose x is the axis (3,), freed of its part along the unit z (3,)."""
     x = axis - (axis @ z) * z
     x = x / np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z], axis=-1)
-    return se3.from_rt(R, centroid - (z @ centroid - offset) * z)
+    return se3.from_rt(np.stack([x, np.cross(z, x), z], axis=-1), origin)
 
 
 def cloud_ply(points: ArrayLike, colors: ArrayLike, comment: str = "") -> bytes:

@@ -47,6 +47,7 @@ __all__ = [
     "save_ply",
     "symmetry_transforms",
     "tensor_mesh",
+    "texels",
     "to_trimesh",
     "transformed",
     "vertex_colors",
@@ -90,10 +91,15 @@ def vertex_colors(mesh: Mesh) -> UInt8 | None:
     """Return RGB per vertex (V, 3): its own, or the texture's at its coordinates, or None."""
     if mesh.colors is not None or mesh.texture is None or mesh.uv is None:
         return mesh.colors
-    height, width = mesh.texture.shape[:2]
-    column = np.floor((mesh.uv[:, 0] % 1.0) * width).astype(int) % width
-    row = np.floor(((1.0 - mesh.uv[:, 1]) % 1.0) * height).astype(int) % height
-    return mesh.texture[row, column]
+    return texels(mesh.texture, mesh.uv)
+
+
+def texels(texture: UInt8, uv: Array) -> UInt8:
+    """Return the RGB (N, 3) of the texels nearest to coordinates (N, 2); the texture repeats."""
+    height, width = texture.shape[:2]
+    column = np.floor((uv[:, 0] % 1.0) * width).astype(int) % width
+    row = np.floor(((1.0 - uv[:, 1]) % 1.0) * height).astype(int) % height
+    return texture[row, column]
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:

@@ -6,7 +6,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64, UInt8
 from realsim.errors import DegenerateError, InputError
-from realsim.geometry.mesh import decimated, sample_surface, tensor_mesh
+from realsim.geometry.mesh import decimated, sample_surface, tensor_mesh, texels
 from realsim.interop import import_open3d
 from realsim.models.mesh_clustering import clustered
 from realsim.models.mesh_topology import Topology, topology
@@ -107,11 +107,7 @@ def colors_at(mesh: Mesh, points: Array) -> UInt8:
     _, face, weights = _closest(mesh, points)
     corners = mesh.faces[face]
     if mesh.texture is not None and mesh.uv is not None:
-        uv = np.einsum("nk,nkd->nd", weights, mesh.uv[corners])
-        height, width = mesh.texture.shape[:2]
-        column = np.floor((uv[:, 0] % 1.0) * width).astype(int) % width
-        row = np.floor(((1.0 - uv[:, 1]) % 1.0) * height).astype(int) % height
-        return mesh.texture[row, column]
+        return texels(mesh.texture, np.einsum("nk,nkd->nd", weights, mesh.uv[corners]))
     if mesh.colors is None:
         raise InputError("the mesh has neither colours nor a texture to take colours from.")
     mean = np.einsum("nk,nkd->nd", weights, mesh.colors[corners].astype(np.float64))

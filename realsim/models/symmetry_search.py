@@ -208,13 +208,15 @@ def _refined_lines(
     scores = np.minimum(surface.near(Ts, config.screening_points), CAP).mean(axis=1)
     found: list[tuple[Array, Array, IsometryFit]] = []
     for i in _best(scores, directions, count):
-        E = refinement(
-            surface, Ts[i : i + 1], config.fitting_points, (*COARSE_SCALES, *FINE_SCALES)
-        )
-        T = E @ Ts[i : i + 1] @ se3.invert(E)
-        fit = fits_of(surface, T, config, config.fitting_points)[0]
+        E, fit = _refined(surface, config, Ts[i : i + 1])
         found.append((E[:3, :3] @ directions[i], E[:3, 3], fit))
     return found
+
+
+def _refined(surface: Surface, config: SymmetryConfig, T: Array) -> tuple[Array, IsometryFit]:
+    """Return the motion that brings a symmetry (1, 4, 4) to where it fits best, and the fit."""
+    E = refinement(surface, T, config.fitting_points, (*COARSE_SCALES, *FINE_SCALES))
+    return E, fits_of(surface, E @ T @ se3.invert(E), config, config.fitting_points)[0]
 
 
 def found_axes(surface: Surface, config: SymmetryConfig) -> list[Axis]:
@@ -261,9 +263,5 @@ def best_mirror(surface: Surface, config: SymmetryConfig, axes: list[Axis]) -> I
     Ts = np.stack([se3.from_rt(A, np.zeros(3)) for A in tries])
     scores = np.minimum(surface.near(Ts, config.screening_points), CAP).mean(axis=1)
     for i in np.argsort(scores, kind="stable")[: KEPT[5]]:
-        E = refinement(
-            surface, Ts[i : i + 1], config.fitting_points, (*COARSE_SCALES, *FINE_SCALES)
-        )
-        T = E @ Ts[i : i + 1] @ se3.invert(E)
-        fits += fits_of(surface, T, config, config.fitting_points)
+        fits.append(_refined(surface, config, Ts[i : i + 1])[1])
     return min(fits, key=lambda fit: fit.worst)

@@ -13,7 +13,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
-from realsim.geometry.mesh import diameter, face_normals, sample_surface
+from realsim.geometry.mesh import diameter, face_normals, sample_surface, texels
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 
@@ -245,7 +245,4 @@ def _colors(mesh: Mesh, surface: Surface, points: Array) -> Array:
         assert mesh.colors is not None
         return np.einsum("nk,nkc->nc", weights, mesh.colors[corners].astype(np.float64))
     at = np.einsum("nk,nkc->nc", weights, mesh.uv[corners])
-    height, width = mesh.texture.shape[:2]
-    column = np.floor((at[:, 0] % 1.0) * width).astype(int) % width
-    row = np.floor(((1.0 - at[:, 1]) % 1.0) * height).astype(int) % height
-    return mesh.texture[row, column].astype(np.float64)
+    return texels(mesh.texture, at).astype(np.float64)

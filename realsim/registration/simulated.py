@@ -14,7 +14,6 @@ import numpy as np
 from realsim.arrays import Array, Array32, UInt16
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import ray_table
 from realsim.geometry.mesh import sample_surface
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, names_of
 from realsim.registration.evidence import DepthFrame
@@ -34,7 +33,7 @@ from realsim.registration.simulated_lab import (
     with_found_symmetries,
 )
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
+from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 
 __all__ = [
@@ -157,12 +156,10 @@ def render_depth(
     path = None if keep is None else keep / f"{name}.npz"
     if path is not None and path.is_file() and is_whole(path):
         return read_arrays(path)[0]["depth"]
-    scene, rays = RayScene(things), ray_table(camera)
+    scene = RayScene(things)
     images = np.empty((len(Ts_world_cam), camera.height, camera.width), np.uint16)
     for k, T_world_cam in enumerate(Ts_world_cam):
-        directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
-        t, _ = scene.first_hits(T_world_cam[:3, 3], directions)
-        exact = np.where(np.isfinite(t), t, 0).reshape(camera.height, camera.width)
+        exact = scene.view(camera, T_world_cam).depth_m
         measured = sensor.measure(exact, camera, np.random.default_rng([seed, k]))
         images[k] = np.round(measured / np.float32(DEPTH_UNIT_M))
     if path is not None:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.arrays import Array, Mask
 from realsim.geometry import se3
-from realsim.geometry.clouds import fit_plane_ransac, plane_frame, refine_plane
+from realsim.geometry.clouds import fit_plane_ransac, frame_about, plane_frame, refine_plane
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 
@@ -185,10 +185,7 @@ def table_frame(normal: Array, offset: float, aim: Array) -> Array:
     z = normal / np.linalg.norm(normal)
     # World x, unless it is nearly upright; a threshold far from any usual table keeps x steady.
     axis = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = axis - (axis @ z) * z
-    x = x / np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z], axis=-1)
-    return se3.from_rt(R, aim - z * (z @ aim - offset))
+    return frame_about(z, axis, aim - z * (z @ aim - offset))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

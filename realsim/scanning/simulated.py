@@ -85,8 +85,7 @@ def scan_views(
         config: views and errors.
         rng: of the views, the errors and the sensor's noise.
     """
-    from realsim.geometry.camera import ray_table
-    from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
+    from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene
 
     camera = CameraIntrinsics(
         width=config.width, height=config.height, fx=config.focal_px, fy=config.focal_px,
@@ -101,12 +100,9 @@ def scan_views(
         PlacedMesh(0, mesh, T_world_obj),
         PlacedMesh(BACKGROUND, table_square(placed.bounds.mean(0)[:2]), np.eye(4)),
     ])  # fmt: skip
-    rays = ray_table(camera)
     frames: list[DepthFrame] = []
     for index, T_world_cam in enumerate(true):
-        directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
-        t, _ = scene.first_hits(T_world_cam[:3, 3], directions)
-        exact = np.where(np.isfinite(t), t, 0).reshape(camera.height, camera.width)
+        exact = scene.view(camera, T_world_cam).depth_m
         xi = arm_error(rng, config.arm_mm, config.arm_deg)
         T_base_ee = T_world_cam @ se3.invert(T_ee_cam_true) @ se3.exp(xi)
         frames.append(

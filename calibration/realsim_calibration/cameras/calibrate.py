@@ -11,15 +11,9 @@ from realsim.geometry.dh import DhArm
 from realsim.geometry.normal_equations import inverse
 from realsim.records import CameraIntrinsics
 from realsim_calibration.calibrate import CalibrationConfig, determined_priors
-from realsim_calibration.cameras import faults
+from realsim_calibration.cameras import faults, results
 from realsim_calibration.cameras.checks import armless_checks, rig_checks
 from realsim_calibration.cameras.problem import RigProblem, first_state
-from realsim_calibration.cameras.results import (
-    ROBOT_BASE,
-    CamerasReport,
-    SightingReport,
-    pair_reports,
-)
 from realsim_calibration.cameras.rig import Rig, Sighting
 from realsim_calibration.cameras.solve import (
     RigSolution,
@@ -45,7 +39,7 @@ NAN = float("nan")
 
 def calibrate_cameras(
     rig: Rig, config: CalibrationConfig | None = None, arm: DhArm | None = None
-) -> CamerasReport:
+) -> results.CamerasReport:
     """Return all cameras of a rig, calibrated in one joint fit.
 
     Args:
@@ -178,7 +172,7 @@ def _own_lens(
 def _report(
     rig: Rig, start: Start, rows: list[int], solution: RigSolution,
     own: Sequence[CameraIntrinsics | None],
-) -> CamerasReport:  # fmt: skip
+) -> results.CamerasReport:  # fmt: skip
     """Return everything that is known of the calibration."""
     problem, state = solution.problem, solution.state
     parts = dict(zip(start.taken, unseen_views(solution), strict=True))
@@ -196,15 +190,15 @@ def _report(
     cameras = tuple(
         _camera(rig, c, start, rows, solution, views, own[c]) for c in range(len(rig.cameras))
     )
-    report = CamerasReport(
+    report = results.CamerasReport(
         rig=rig,
-        reference=ROBOT_BASE if problem.arm_used else rig.cameras[0].name,
+        reference=results.ROBOT_BASE if problem.arm_used else rig.cameras[0].name,
         cameras=cameras,
         covariance=covariance,
         boards=tuple(
             None if b.place == "free" else Z for b, Z in zip(rig.boards, state.Z, strict=True)
         ),
-        pairs=tuple(pair_reports(rig, state.X, covariance, views, A, problem.middles)),
+        pairs=tuple(results.pair_reports(rig, state.X, covariance, views, A, problem.middles)),
         views=views,
         robot_map=solution.robot_map,
         map_name="none" if solution.basis is None else solution.basis.name,
@@ -216,11 +210,11 @@ def _report(
 
 def _sighting(
     rig: Rig, k: int, part: UnseenView | None, reason: str, taken: dict[int, Sighting]
-) -> SightingReport:
+) -> results.SightingReport:
     """Return one view's part."""
     given = rig.sightings[k]
     s = taken.get(k, given)
-    return SightingReport(
+    return results.SightingReport(
         camera=rig.cameras[given.camera].name, board=rig.boards[given.board].name,
         instant=given.instant, used=part is not None, reason=reason,
         name=given.name or f"{rig.cameras[given.camera].name}/{rig.instants[given.instant].name}",
@@ -231,7 +225,7 @@ def _sighting(
 
 def _camera(
     rig: Rig, c: int, start: Start, rows: list[int], solution: RigSolution,
-    views: tuple[SightingReport, ...], own: CameraIntrinsics | None,
+    views: tuple[results.SightingReport, ...], own: CameraIntrinsics | None,
 ) -> HandEyeReport:  # fmt: skip
     """Return one camera's calibration as that of a camera alone.
 

@@ -3,37 +3,31 @@
 import numpy as np
 
 from realsim.arrays import Array, Mask
-from realsim_calibration.faults.diagnosis import (
-    OTHER_VIEW,
-    SAME_POSE_DEG,
-    SAME_POSE_MM,
-    SAME_VIEW,
-    Fault,
-)
+from realsim_calibration.faults import diagnosis
 from realsim_calibration.faults.frame_fit import UNIT_DEG, UNIT_PART, chord_angle
 
 Groups = tuple[tuple[int, ...], ...]
 
 
-def find_copies(T: Array, C: Array, middle: Array) -> dict[Fault, Groups]:
+def find_copies(T: Array, C: Array, middle: Array) -> dict[diagnosis.Fault, Groups]:
     """Return the groups of (n, 4, 4) hand and board poses that repeat each other, worst first.
 
     A frozen pose has different images, a repeated image different poses; of a duplicate both are
     the same.
     """
     unit = _length_unit(T)
-    same_hand = _near(T, 1e-3 * SAME_POSE_MM * unit, np.radians(SAME_POSE_DEG))
+    same_hand = _near(T, 1e-3 * diagnosis.SAME_POSE_MM * unit, np.radians(diagnosis.SAME_POSE_DEG))
     q = C[:, :3, :3] @ middle + C[:, :3, 3]
     distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
     turn = chord_angle(C[:, None, :3, :3], C[None, :, :3, :3])
     slip = np.linalg.norm(q[:, None] - q[None], axis=-1) / distance
     seen = np.hypot(turn / np.radians(UNIT_DEG), slip / UNIT_PART)
     # The same image gives the same numbers; a second photograph of the same view does not.
-    same_image = seen < 1e-6 * SAME_VIEW
+    same_image = seen < 1e-6 * diagnosis.SAME_VIEW
     return {
-        "frozen_pose": _groups(same_hand & (seen > OTHER_VIEW)),
+        "frozen_pose": _groups(same_hand & (seen > diagnosis.OTHER_VIEW)),
         "repeated_image": _groups(same_image & ~same_hand),
-        "duplicated_views": _groups(same_hand & (seen < SAME_VIEW)),
+        "duplicated_views": _groups(same_hand & (seen < diagnosis.SAME_VIEW)),
     }
 
 

@@ -23,12 +23,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim_calibration.fit.closed_forms import (
-    MIN_VIEWS,
-    clear_of_half_turns,
-    motions,
-    pose_stacks,
-)
+from realsim_calibration.fit import closed_forms
 
 RIDGE = 1e-9
 """Share of the mean curvature that decides what the views do not determine."""
@@ -120,7 +115,7 @@ def fit_frames(
     Raises:
         InputError: fewer than three views, or stacks of different lengths.
     """
-    A, C = pose_stacks(A, C, "hand-eye", least=MIN_VIEWS)
+    A, C = closed_forms.pose_stacks(A, C, "hand-eye", least=closed_forms.MIN_VIEWS)
     m = np.asarray(middle, dtype=np.float64)
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     rng = np.random.default_rng(SEED)
@@ -173,8 +168,8 @@ def _draw(n: int, size: int, samples: int, rng: np.random.Generator) -> Int64:
 
 def _turns(A: Array, C: Array) -> tuple[Array, Array]:
     """Return the turns (n, n, 3) of hand and camera between views, 0 near half turns [rad]."""
-    hand, cam = motions(A, C)
-    clear = clear_of_half_turns(hand, cam)[:, None]
+    hand, cam = closed_forms.motions(A, C)
+    clear = closed_forms.clear_of_half_turns(hand, cam)[:, None]
     i, j = np.triu_indices(len(A), 1)
     turns = np.zeros((2, len(A), len(A), 3))
     turns[0, i, j], turns[1, i, j] = hand.turns * clear, cam.turns * clear
@@ -203,7 +198,7 @@ def _start_rotations(A: Array, C: Array, rng: np.random.Generator) -> tuple[Arra
     X, Z = Rx[best], Rz[best]
     for _ in range(2):
         good = chord_angle(Ra @ X @ np.swapaxes(Rd, -1, -2), Z) < limit
-        if good.sum() < MIN_VIEWS:
+        if good.sum() < closed_forms.MIN_VIEWS:
             break
         w = good[:, None] & good[None, :]
         X = _nearest_rotations(np.einsum("ij,ijk,ijl->kl", w.astype(float), a, b))

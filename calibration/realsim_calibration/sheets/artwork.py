@@ -12,12 +12,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Mask, UInt8
 from realsim.errors import InputError
 from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.targets.marker_sets import (
-    check_markers,
-    load_dictionary,
-    marker_modules,
-    tag_dictionary,
-)
+from realsim_calibration.targets import marker_sets
 
 DOT_SHARE = 0.5
 """Diameter of a dot as a share of the distance to its nearest neighbour: large for accurate
@@ -60,7 +55,7 @@ def artwork_of(target: Target) -> Artwork:
     Raises:
         InputError: its markers do not exist.
     """
-    check_markers(target)
+    marker_sets.check_markers(target)
     if isinstance(target, TagBoard):
         return _tag_board(target)
     if isinstance(target, CharucoBoard):
@@ -111,7 +106,7 @@ def _tag_board(board: TagBoard) -> Artwork:
     for k, tag_id in enumerate(board.ids):
         row, column = divmod(k, board.columns)
         r, c = outer + row * (cells + 1), outer + column * (cells + 1)
-        modules = marker_modules(tag_dictionary(board.family), int(tag_id))
+        modules = marker_sets.marker_modules(marker_sets.tag_dictionary(board.family), int(tag_id))
         black[r : r + cells, c : c + cells] = modules
     if outer:
         black[:: cells + 1, :: cells + 1] = True
@@ -128,7 +123,7 @@ def _charuco(board: CharucoBoard) -> Artwork:
     """Return the fields and markers of a ChArUco board, placed by OpenCV's own board."""
     from cv2 import aruco
 
-    dictionary = load_dictionary(board.dictionary)
+    dictionary = marker_sets.load_dictionary(board.dictionary)
     size = (board.columns, board.rows)
     layout = aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
     layout.setLegacyPattern(board.legacy)
@@ -142,7 +137,7 @@ def _charuco(board: CharucoBoard) -> Artwork:
         column, row = np.floor(np.mean(corners, axis=0)[:2] / board.square_m).astype(int)
         field = black[row * per : (row + 1) * per, column * per : (column + 1) * per]
         field[:] = False
-        field[1:-1, 1:-1] = marker_modules(board.dictionary, int(marker_id))
+        field[1:-1, 1:-1] = marker_sets.marker_modules(board.dictionary, int(marker_id))
     return Artwork(x_m=x, y_m=y, black=black, dots=np.zeros((0, 3)))
 
 

@@ -6,14 +6,8 @@ from pathlib import Path
 
 from realsim.errors import InputError
 from realsim.formats.colmap.model import ColmapImage, ColmapModel, find_model, read_model
+from realsim.formats.folders import posed_images
 from realsim.formats.folders.listing import image_header, natural_key, shown
-from realsim.formats.folders.posed_images import (
-    PosedImage,
-    PosedImages,
-    checked_by_depth,
-    require_scale,
-    same_camera,
-)
 from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
 
@@ -66,7 +60,7 @@ def open_colmap(
     depth_folder: Path | str | None = None,
     depth_unit_m: float | None = None,
     use_depth: bool = True,
-) -> PosedImages:
+) -> posed_images.PosedImages:
     """Return a COLMAP model with its images as a frame source.
 
     Args:
@@ -89,7 +83,7 @@ def open_colmap(
             f"{root} holds no COLMAP model: cameras and images (.bin or .txt) were looked for "
             "there and in sparse/0, sparse, model, colmap and dense/sparse."
         )
-    require_scale(metres_per_unit)
+    posed_images.require_scale(metres_per_unit)
     model = read_model(folder)
     chosen, camera, notes = _of_one_camera(model, camera_id)
     there = _images_there(_images_place(root, folder, images_folder, chosen), chosen, camera, notes)
@@ -103,7 +97,7 @@ def open_colmap(
     if use_depth and (depth_folder is not None or depth_unit_m is not None):
         depth = find_depth(root, depth_folder, [i.name for i, _ in there], notes)
     posed = [
-        PosedImage(
+        posed_images.PosedImage(
             name=i.name, colour=p, depth=depth.get(i.name), intrinsics=camera,
             T_world_cam=i.T_world_cam,
         )
@@ -111,7 +105,7 @@ def open_colmap(
         if not depth or i.name in depth
     ]  # fmt: skip
     if depth:
-        unit_m, _, said = checked_by_depth(
+        unit_m, _, said = posed_images.checked_by_depth(
             posed, camera, depth_unit_m, str(folder), metres_per_unit, REMEDY
         )
         notes += said
@@ -121,7 +115,7 @@ def open_colmap(
             "taken as if its unit were the metre. Give --scale (metres per unit) once it is known, "
             "such as a measured distance over the same distance in the model."
         )
-    return PosedImages(
+    return posed_images.PosedImages(
         kind="colmap",
         path=model.folder,
         name=root.resolve().name if folder != root else folder.resolve().parent.name,
@@ -145,7 +139,7 @@ def _of_one_camera(
         raise InputError(f"the COLMAP model {model.folder} has no registered image.")
     groups: dict[int, list[int]] = {}
     for k, camera in sorted(model.cameras.items()):
-        first = next((g for g in groups if same_camera(camera, model.cameras[g])), k)
+        first = next((g for g in groups if posed_images.same_camera(camera, model.cameras[g])), k)
         groups.setdefault(first, []).append(k)
     counts = {g: sum(i.camera_id in members for i in model.images) for g, members in groups.items()}
     listed = "; ".join(

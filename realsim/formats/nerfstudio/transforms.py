@@ -21,18 +21,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from realsim import interop
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.folders.listing import ENDINGS, image_header, natural_key, shown
 from realsim.formats.folders.posed_images import PosedImage
 from realsim.formats.plausible_camera import require_plausible
 from realsim.geometry import se3
-from realsim.interop import (
-    T_world_cam_from_gl,
-    T_world_gl_from_cam,
-    colmap_from_opencv_px,
-    opencv_from_colmap_px,
-)
 from realsim.records import CameraIntrinsics
 from realsim.untrusted import json_text, values
 
@@ -93,7 +88,7 @@ def intrinsics_of(
         values.number(found.get(key, side / 2), f"'{key}' of {where}")
         for key, side in (("cx", width), ("cy", height))
     ]
-    cx, cy = (float(v) for v in opencv_from_colmap_px(at))
+    cx, cy = (float(v) for v in interop.opencv_from_colmap_px(at))
     camera = CameraIntrinsics(
         width=width, height=height, fx=fx, fy=fx if fy is None else fy, cx=cx, cy=cy,
         distortion=np.array([values.number(found.get(k, 0.0), f"'{k}' of {where}") for k in LENS]),
@@ -168,7 +163,7 @@ def camera_entry(camera: CameraIntrinsics, where: str) -> dict[str, Any]:
             "nerfstudio's model has no place for them (its k4 is another). Export as COLMAP, whose "
             "FULL_OPENCV has, or calibrate with k1 k2 p1 p2 k3."
         )
-    cx, cy = (float(v) for v in colmap_from_opencv_px([camera.cx, camera.cy]))
+    cx, cy = (float(v) for v in interop.colmap_from_opencv_px([camera.cx, camera.cy]))
     return {
         "w": camera.width, "h": camera.height, "fl_x": float(camera.fx), "fl_y": float(camera.fy),
         "cx": cx, "cy": cy, **dict(zip(LENS, d, strict=False)),
@@ -180,7 +175,7 @@ def camera_entry(camera: CameraIntrinsics, where: str) -> dict[str, Any]:
 
 def transform_matrix(T_world_cam: ArrayLike) -> list[list[float]]:
     """Return the rows of `transform_matrix` of a pose (4, 4)."""
-    rows: list[list[float]] = T_world_gl_from_cam(T_world_cam).tolist()
+    rows: list[list[float]] = interop.T_world_gl_from_cam(T_world_cam).tolist()
     return rows
 
 
@@ -190,7 +185,7 @@ def T_world_cam_of(matrix: Any, where: str) -> Array:
     Raises:
         InputError: it is no 4x4 (or 3x4) matrix, or not rigid.
     """
-    return T_world_cam_from_gl(se3.check_rigid(_matrix(matrix, where), where))
+    return interop.T_world_cam_from_gl(se3.check_rigid(_matrix(matrix, where), where))
 
 
 def _matrix(value: Any, where: str) -> Array:
