@@ -23,7 +23,6 @@ from realsim_calibration.faults.motion_check import roll_range_deg
 from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MIN_VIEWS, check_observable
 from realsim_calibration.fit.joint_solve import JointConfig
-from realsim_calibration.fit.noise_scale import NoiseConfig
 from realsim_calibration.results import Mode
 from realsim_calibration.views import BoardView, TargetDetection
 
@@ -37,7 +36,6 @@ class HandEyeConfig:
 
     mode: Mode = "eye_in_hand"
     joint: JointConfig = field(default_factory=JointConfig)
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
     robot_map: bool = True
     """Whether maps of the robot's error are tried."""
     min_points: int = 8

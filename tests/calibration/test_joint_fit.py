@@ -8,7 +8,7 @@ from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
 from realsim.robots.arm import find_arm
 from realsim_calibration.fit.joint_solve import FLAT, JointConfig, JointProblem, Setup, ViewCorners
 from realsim_calibration.fit.linear_model import LinearModel
-from realsim_calibration.fit.noise_scale import NoiseConfig, largest_ratio, whiteness
+from realsim_calibration.fit.noise_scale import largest_ratio, whiteness
 from realsim_calibration.fit.robot_error import arm_basis, map_basis, map_record
 from realsim_calibration.fit.view_system import (
     camera_from_board,
@@ -169,7 +169,7 @@ def test_the_likelihood_finds_the_robots_share(simulate):
     for robot in (0.1e-3, 1e-3):
         problem, state, _ = fitted(simulate(3, views=30, robot=(robot, robot)))
         model = LinearModel(problem, state, problem.ones())
-        ratio = estimate_ratio(model, None, 0.1, 50.0, NoiseConfig())
+        ratio = estimate_ratio(model, None, 0.1, 50.0)
         assert 0.6 < ratio[0] / (robot / px) < 1.7
         assert 0.6 < ratio[1] / (robot / 0.4 / px) < 1.7
 
@@ -177,15 +177,15 @@ def test_the_likelihood_finds_the_robots_share(simulate):
 def test_a_warped_print_shows_as_correlated_corners(simulate):
     sim = simulate(4, views=12)
     problem, state, _ = fitted(sim)
-    white = whiteness(problem, state, NoiseConfig())
-    assert white.excess < 0.1 and largest_ratio(white, NoiseConfig()) > 3
+    white = whiteness(problem, state)
+    assert white.excess < 0.1 and largest_ratio(white) > 3
     views = []
     for v in sim.views:
         x = v.detection.uv[:, 0]
         bent = v.detection.uv + np.stack([0 * x, 0.8 * np.sin(x / 90.0)], -1)
         views.append(replace(v, detection=replace(v.detection, uv=bent)))
-    bent_white = whiteness(problem_of(sim, views), state, NoiseConfig())
-    assert bent_white.excess > 1 and largest_ratio(bent_white, NoiseConfig()) == 0.3
+    bent_white = whiteness(problem_of(sim, views), state)
+    assert bent_white.excess > 1 and largest_ratio(bent_white) == 0.3
 
 
 def test_records_of_maps_give_the_basis_errors():

@@ -86,7 +86,7 @@ def solve_rig(
     Raises:
         DegenerateError: the views do not determine the parameters.
     """
-    noise, bound = config.noise, np.full(2, config.noise.bound)
+    bound = np.full(2, noise_scale.BOUND)
     sigmas = np.full(len(problem.rig.cameras), config.joint.start_sigma_px)
     state = optimize(problem, start, None, np.zeros(2), sigmas, problem.ones(), config)
     sigmas, roots = spread(problem, state, sigmas, config)
@@ -94,23 +94,23 @@ def solve_rig(
         state = optimize(problem, state, None, bound, sigmas, roots, config)
         sigmas, roots = spread(problem, state, sigmas, config)
     model = RigModel(problem, state, sigmas, roots)
-    whites = _whiteness(problem, state, noise)
-    most = min(noise_scale.largest_ratio(w, noise) for w in whites)
-    ratio = noise_scale.estimate_ratio(model, None, 1.0, most, noise)
+    whites = _whiteness(problem, state)
+    most = min(noise_scale.largest_ratio(w) for w in whites)
+    ratio = noise_scale.estimate_ratio(model, None, 1.0, most)
     none = Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, 1.0))
     choices, known = [none], None
     Ts = state.A
     if config.robot_map and problem.arm_used:
-        choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise.bound))
+        choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise_scale.BOUND))
         if arm is not None and joints is not None:
             basis = arm_basis(arm, joints, Ts)
-            arm_ratio, known = noise_scale.estimate_arm(model, basis, 1.0, noise)
+            arm_ratio, known = noise_scale.estimate_arm(model, basis, 1.0, None)
             fit = model.fit(known, arm_ratio, 1.0)
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
     best = chosen_of(choices)
     ratio = best.ratio
     if best.basis is not None and best.basis.kind != "arm":
-        ratio = noise_scale.estimate_ratio(model, best.basis, 1.0, most, noise)
+        ratio = noise_scale.estimate_ratio(model, best.basis, 1.0, most)
     alone = model.moved(none.fit.step, None, none.ratio)
     state = model.moved(best.fit.step, best.basis, ratio)
     state = optimize(problem, state, best.basis, ratio, sigmas, roots, config)
@@ -187,9 +187,7 @@ def spread(
     return np.sqrt(np.maximum(total, 1e-12) / np.maximum(count, 1.0)), roots
 
 
-def _whiteness(
-    problem: RigProblem, state: RigState, config: noise_scale.NoiseConfig
-) -> list[noise_scale.Whiteness]:
+def _whiteness(problem: RigProblem, state: RigState) -> list[noise_scale.Whiteness]:
     """Return whether corners are independent inside the views of every camera and board.
 
     A free pose a view is fitted, so that only lens and board matter: its pose stands for the arm's.
@@ -217,7 +215,7 @@ def _whiteness(
             X=np.eye(4), Z=np.eye(4), camera=state.lens[c], board=state.shape[b],
             weights=np.zeros(0), errors=np.zeros((len(ks), 6)),
         )  # fmt: skip
-        white = noise_scale.whiteness(one, at, config)
+        white = noise_scale.whiteness(one, at)
         if np.isfinite(white.ratio):
             found.append(white)
     return found or [noise_scale.Whiteness(ratio=float("nan"), sd=float("nan"))]

@@ -28,27 +28,21 @@ rotation and 1.3 for the translation of a UR with random errors of its joints an
 SCALE_LOG_SD = 0.7
 """1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
 24 or more errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class NoiseConfig:
-    """Between which limits the robot's share is estimated."""
-
-    least: float = 0.05
-    """Smallest lambda: below, a robot error is invisible beside a single corner's."""
-    bound: float = 0.3
-    """lambda where corner errors are correlated; 0.1 to 0.5 predict real unseen views alike, 1 and
-    more worse."""
-    most: float = 50.0
-    """Largest lambda: a robot that is 50 times worse than the corners."""
-    apart_log_sd: float = 1.0
-    """1-sigma of log(lambda of rotation / lambda of translation) before the views are seen."""
-    evaluations: int = 50
-    """Likelihoods in one search for two numbers."""
-    degree: int = 2
-    """Degree of the smooth residuals' polynomials: what lenses and warped boards leave."""
-    min_spare: int = 6
-    """Views with fewer coordinates left than this do not say whether corner errors are smooth."""
+LEAST = 0.05
+"""Smallest lambda: below, a robot error is invisible beside a single corner's."""
+BOUND = 0.3
+"""lambda where corner errors are correlated; 0.1 to 0.5 predict real unseen views alike, 1 and more
+worse."""
+MOST = 50.0
+"""Largest lambda: a robot that is 50 times worse than the corners."""
+APART_LOG_SD = 1.0
+"""1-sigma of log(lambda of rotation / lambda of translation) before the views are seen."""
+EVALUATIONS = 50
+"""Likelihoods in one search for two numbers."""
+DEGREE = 2
+"""Degree of the smooth residuals' polynomials: what lenses and warped boards leave."""
+MIN_SPARE = 6
+"""Views with fewer coordinates left than this do not say whether corner errors are smooth."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,7 +62,7 @@ class Whiteness:
         return max(self.ratio - 1.0 - 2.0 * self.sd, 0.0)
 
 
-def whiteness(problem: JointProblem, state: JointState, config: NoiseConfig) -> Whiteness:
+def whiteness(problem: JointProblem, state: JointState) -> Whiteness:
     """Return how far the residuals left by a free pose per view are from independent."""
     smooth = rough = 0.0
     smooth_count = rough_count = 0
@@ -77,14 +71,14 @@ def whiteness(problem: JointProblem, state: JointState, config: NoiseConfig) -> 
         free_pose, _ = np.linalg.qr(rows[:, :6])
         r = rows[:, -1] - free_pose @ (free_pose.T @ rows[:, -1])
         x, y = (view.xy / problem.setup.half_extent).T
-        powers = [(a, b) for a in range(config.degree + 1) for b in range(config.degree + 1 - a)]
+        powers = [(a, b) for a in range(DEGREE + 1) for b in range(DEGREE + 1 - a)]
         terms = np.stack([x**a * y**b for a, b in powers], -1)
         S = (terms[:, None, :, None] * np.eye(2)[:, None]).reshape(len(r), -1)  # Kronecker's
         S = S - free_pose @ (free_pose.T @ S)
         u, s, _ = np.linalg.svd(S, full_matrices=False)
         u = u[:, s > 1e-6 * max(float(s[0]), 1e-12)]
         spare = len(r) - 6 - u.shape[1]
-        if spare < config.min_spare:
+        if spare < MIN_SPARE:
             continue
         inside = float(np.sum((u.T @ r) ** 2))
         smooth, smooth_count = smooth + inside, smooth_count + u.shape[1]
@@ -95,11 +89,11 @@ def whiteness(problem: JointProblem, state: JointState, config: NoiseConfig) -> 
     return Whiteness(ratio=ratio, sd=float(np.sqrt(2 / smooth_count + 2 / rough_count)))
 
 
-def largest_ratio(white: Whiteness, config: NoiseConfig) -> float:
+def largest_ratio(white: Whiteness) -> float:
     """Return the largest lambda that the corner errors allow."""
     if white.excess <= 0:
-        return config.most
-    return float(np.clip(config.bound / white.excess, config.bound, config.most))
+        return MOST
+    return float(np.clip(BOUND / white.excess, BOUND, MOST))
 
 
 def _search(deviance: Callable[[Array], float], start: Array, evaluations: int) -> Array:
@@ -111,49 +105,50 @@ def _search(deviance: Callable[[Array], float], start: Array, evaluations: int) 
     return minimize(deviance, start, method="Nelder-Mead", options=options).x
 
 
-def _ratio_prior(x: Array, most: float, config: NoiseConfig) -> tuple[Array, float]:
+def _ratio_prior(x: Array, least: float, most: float) -> tuple[Array, float]:
     """Return lambda (2,) of logarithms inside the limits, and the price of the logarithms."""
-    low, high = float(np.log(config.least)), float(np.log(max(most, config.least * 1.01)))
+    low, high = float(np.log(least)), float(np.log(max(most, least * 1.01)))
     inside = np.clip(x, low, high)
-    apart = float(x[0] - x[1]) / config.apart_log_sd
+    apart = float(x[0] - x[1]) / APART_LOG_SD
     return np.exp(inside), apart**2 + 100.0 * float(np.sum((x - inside) ** 2))
 
 
 def estimate_ratio(
-    model: LinearModel, basis: ErrorBasis | None, sigma: float, most: float, config: NoiseConfig
+    model: LinearModel, basis: ErrorBasis | None, sigma: float, most: float
 ) -> Array:
     """Return lambda (2,) for rotation and translation of largest marginal likelihood."""
 
     def deviance(x: Array) -> float:
-        ratio, price = _ratio_prior(x, most, config)
+        ratio, price = _ratio_prior(x, LEAST, most)
         return model.deviance(basis, ratio, sigma) + price
 
-    start = np.full(2, float(np.log(min(config.bound, most))))
-    return _ratio_prior(_search(deviance, start, config.evaluations), most, config)[0]
+    start = np.full(2, float(np.log(min(BOUND, most))))
+    return _ratio_prior(_search(deviance, start, EVALUATIONS), LEAST, most)[0]
 
 
 def estimate_arm(
-    model: LinearModel, basis: ErrorBasis, sigma: float, config: NoiseConfig
+    model: LinearModel, basis: ErrorBasis, sigma: float, fixed: float | None
 ) -> tuple[Array, ErrorBasis]:
     """Return lambda (2,) and the arm's basis with its angles and lengths scaled to the views.
 
     Four logarithms: lambda for rotation and translation, angles, lengths. The scales have a prior
-    of a factor of two, so that few views leave them where arms usually are.
+    of a factor of two, so that few views leave them where arms usually are. A given lambda is held.
     """
+    least, most = (fixed, fixed) if fixed else (LEAST, MOST)
 
     def factors(x: Array) -> Array:
         return np.repeat(np.exp(np.clip(x[2:], -7.0, 7.0)), len(basis.unit) // 2)
 
     def deviance(x: Array) -> float:
-        ratio, price = _ratio_prior(x[:2], config.most, config)
+        ratio, price = _ratio_prior(x[:2], least, most)
         prior = float(np.sum((x[2:] / SCALE_LOG_SD) ** 2))
         return model.deviance(basis.scaled(factors(x)), ratio, sigma) + prior + price
 
-    start = np.array([*[float(np.log(config.bound))] * 2, 0.0, 0.0])
-    x = _search(deviance, start, 2 * config.evaluations)
+    start = np.array([*[float(np.log(BOUND))] * 2, 0.0, 0.0])
+    x = _search(deviance, start, 2 * EVALUATIONS)
     # So few errors tell their own size only roughly: E[scale^2] is above the likeliest one.
     x[2:] += [_log_variance(deviance, x, k, SCALE_LOG_SD) for k in (2, 3)]
-    return _ratio_prior(x[:2], config.most, config)[0], basis.scaled(factors(x))
+    return _ratio_prior(x[:2], least, most)[0], basis.scaled(factors(x))
 
 
 def _log_variance(deviance: Callable[[Array], float], x: Array, k: int, prior_sd: float) -> float:

@@ -138,13 +138,12 @@ def solve(
     Ts = np.stack([v.T_base_ee for v in setup.views])
     known: ErrorBasis | None = None
     if config.robot_map:
-        bounded = ratio if fixed else np.minimum(ratio, config.noise.bound)
+        bounded = ratio if fixed else np.minimum(ratio, noise_scale.BOUND)
         choices += map_choices(model, Ts, sigma, bounded)
     if arm is not None and joints is not None:
         # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
-        noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
         basis = arm_basis(arm, joints, Ts)
-        arm_ratio, known = noise_scale.estimate_arm(model, basis, sigma, noise)
+        arm_ratio, known = noise_scale.estimate_arm(model, basis, sigma, fixed)
         fit = model.fit(known, arm_ratio, sigma)
         if config.robot_map:
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
@@ -152,7 +151,7 @@ def solve(
     if best.basis is not None and best.basis.kind != "arm":
         basis = _mean_strength(best.basis, choices)
         if not fixed:
-            ratio = noise_scale.estimate_ratio(model, basis, sigma, most, config.noise)
+            ratio = noise_scale.estimate_ratio(model, basis, sigma, most)
         used = ratio if not fixed else best.ratio
         best = Choice(basis=basis, ratio=used, fit=model.fit(basis, used, sigma))
     alone = state.moved(none.fit.step)
@@ -198,7 +197,7 @@ def _first_fit(
 ) -> tuple[JointState, float, Array]:
     """Return the fit at the bounded lambda, sigma, and the roots of the corner weights."""
     joint = config.joint
-    ratio = np.full(2, joint.robot_ratio or config.noise.bound)
+    ratio = np.full(2, joint.robot_ratio or noise_scale.BOUND)
     state, roots = problem.start(*start), problem.ones()
     state = problem.optimize(state, joint.start_sigma_px, np.zeros(2), roots, None)
     sigma, roots = problem.spread(state, joint.start_sigma_px, ratio, None)
@@ -213,16 +212,15 @@ def _robot_share(
     config: "HandEyeConfig",
 ) -> tuple[noise_scale.Whiteness, float, Array]:  # fmt: skip
     """Return whether corners are independent, the largest lambda, and lambda (2,) without a map."""
-    noise = config.noise
     if config.joint.robot_ratio:
-        white = noise_scale.whiteness(problem, state, noise)
+        white = noise_scale.whiteness(problem, state)
         return white, config.joint.robot_ratio, np.full(2, config.joint.robot_ratio)
-    free = noise_scale.estimate_ratio(model, None, sigma, noise.most, noise)
+    free = noise_scale.estimate_ratio(model, None, sigma, noise_scale.MOST)
     # Judged where the lens is fitted with the robot's share as it would like to be.
-    white = noise_scale.whiteness(problem, state.moved(model.fit(None, free, sigma).step), noise)
-    most = noise_scale.largest_ratio(white, noise)
-    if most < noise.most:
-        free = noise_scale.estimate_ratio(model, None, sigma, most, noise)
+    white = noise_scale.whiteness(problem, state.moved(model.fit(None, free, sigma).step))
+    most = noise_scale.largest_ratio(white)
+    if most < noise_scale.MOST:
+        free = noise_scale.estimate_ratio(model, None, sigma, most)
     return white, most, free
 
 

@@ -30,7 +30,7 @@ from realsim.registration.odometry.mismatch import Mismatch, find_mismatches, ha
 from realsim.registration.odometry.pairs import (
     LEAST_POINTS,
     Edge,
-    PairConfig,
+    FitConfig,
     PairMeter,
     ViewCloud,
     further_pairs,
@@ -95,8 +95,6 @@ def unmatched_words(view: int) -> str:
     )
 
 
-PAIRS = PairConfig()
-"""Which views are aligned, and how."""
 FURTHER = 2
 """More pairs for a view that a pair makes suspect."""
 FURTHER_SHARE = 0.35
@@ -260,16 +258,16 @@ class _Found:
 
 def _examine(clouds: Sequence[ViewCloud], claimed: Array) -> _Found:
     """Return mismatches first, then the faults of the poses that the images do belong to."""
-    meter = PairMeter(clouds, PAIRS)
+    meter = PairMeter(clouds, FitConfig())
     aim = _middle(clouds, claimed)
-    angles = view_angles(claimed, aim, PAIRS.zoom_deg)
+    angles = view_angles(claimed, aim)
     everyone = list(range(len(claimed)))
     edges = _measure_pairs(meter, claimed, angles, everyone)
     mismatches, poses = find_mismatches(meter, claimed, edges, angles)
     Ts = claimed[np.maximum(poses, 0)]
     kept = [k for k in everyone if poses[k] >= 0]
     if mismatches:
-        angles = view_angles(Ts, aim, PAIRS.zoom_deg)
+        angles = view_angles(Ts, aim)
         edges = _measure_pairs(meter, Ts, angles, kept)
     trusted = [e for e in edges if not has_failed(e)]
     faults, mended = find_faults(Ts, trusted, aim)
@@ -298,7 +296,7 @@ def _examine(clouds: Sequence[ViewCloud], claimed: Array) -> _Found:
 def _measure_pairs(meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[int]) -> list[Edge]:
     """Return the pairs of neighbours, and more of those that a pair makes suspect."""
     inner = angles[np.ix_(kept, kept)]
-    pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner, PAIRS)]
+    pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner)]
     edges = [meter.measure(i, j, relative(Ts, i, j)) for i, j in pairs]
     r = differences(Ts, edges)
     large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > LEAST_MM) | (
@@ -310,7 +308,7 @@ def _measure_pairs(meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[in
         return edges
     outside = np.full(angles.shape, np.inf)
     outside[np.ix_(kept, kept)] = inner
-    more = further_pairs(outside, pairs, doubted, FURTHER, PAIRS)
+    more = further_pairs(outside, pairs, doubted, FURTHER)
     return edges + [meter.measure(i, j, relative(Ts, i, j)) for i, j in more]
 
 

@@ -41,7 +41,7 @@ CAUCHY = 2.0
 """Whitened length from which a pair counts less: a wrong loop must not bend the path."""
 INFLATION = 2.0
 """Sigmas are enlarged by this: pairs of one view share its depth errors."""
-PAIRS = pairs.PairConfig(fit=pairs.FitConfig(convergence=1e-5, max_iterations=300))
+FIT = pairs.FitConfig(convergence=1e-5, max_iterations=300)
 """Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
 KEY_DEG = 16.0
 """A view this far from the last key view becomes one [deg]; drift grows with their number, and
@@ -179,9 +179,9 @@ def hand_held_poses(
         [se3.transform(T, c.source).mean(0) for T, c in zip(Ts, clouds, strict=True)], 0
     )
     levelled = tuple(c.normal is not None for c in clouds)
-    angles = pairs.view_angles(Ts, aim, PAIRS.zoom_deg)
+    angles = pairs.view_angles(Ts, aim)
     Ts = optimise_poses(Ts, path.edges, levelled, angles).Ts_world_cam
-    loops = _loops(path, Ts, pairs.view_angles(Ts, aim, PAIRS.zoom_deg))
+    loops = _loops(path, Ts, pairs.view_angles(Ts, aim))
     graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles)
     r = graph.residuals if len(graph.residuals) else np.zeros((1, 6))
     return HandHeld(
@@ -231,7 +231,7 @@ class _Path:
     def __init__(self, clouds: Sequence[pairs.ViewCloud]) -> None:
         """Begin with the first view, over the table."""
         self.clouds = list(clouds)
-        self.meter = pairs.PairMeter(self.clouds, PAIRS)
+        self.meter = pairs.PairMeter(self.clouds, FIT)
         first = self.clouds[0]
         assert first.normal is not None  # checked when the clouds were made
         T_cam_table = plane_frame(first.normal, first.offset, first.target)

@@ -12,7 +12,7 @@ length of its step, rotation and translation in one number [rad, m].
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -232,24 +232,19 @@ def _largest(p: Array, rng: np.random.Generator) -> tuple[Array, float] | None:
     return _refine_table(p, n, float(d)) if d < 0 else _refine_table(p, -n, -float(d))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PairConfig:
-    """How two views are aligned and which are."""
-
-    fit: FitConfig = field(default_factory=FitConfig)
-    voxel_m: float = 0.004
-    """Edge of the voxels of the map [m]; partners are found up to two of them away."""
-    points_per_voxel: int = 2
-    """Points kept in each: the clouds are averaged in voxels of this size already."""
-    reach_m: float = 0.010
-    """Distances beyond this count as this much [m]: such a point has no partner."""
-    partner_m: float = 0.005
-    """A point with another this near has a partner [m]: the spacing of the averaged points."""
-    zoom_deg: float = 20.0
-    """Being e times as far away makes two views as different as this angle [deg]."""
-    most_deg: float = 40.0
-    """Views farther apart than this are paired only if the tree needs it [deg]: beyond it the
-    alignment is wrong by 1.3 mm in simulation, within 15 degrees by 0.25."""
+VOXEL_M = 0.004
+"""Edge of the voxels of a view's map [m]; partners are found up to two of them away."""
+POINTS_PER_VOXEL = 2
+"""Points kept in each: the clouds are averaged in voxels of this size already."""
+REACH_M = 0.010
+"""Distances beyond this count as this much [m]: such a point has no partner."""
+PARTNER_M = 0.005
+"""A point with another this near has a partner [m]: the spacing of the averaged points."""
+ZOOM_DEG = 20.0
+"""Being e times as far away makes two views as different as this angle [deg]."""
+MOST_DEG = 40.0
+"""Views farther apart than this are paired only if the tree needs it [deg]: beyond it the alignment
+is wrong by 1.3 mm in simulation, within 15 degrees by 0.25."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -269,10 +264,10 @@ class Edge:
 class PairMeter:
     """Measures relative poses of views; the map of each view is made once, when it is needed."""
 
-    def __init__(self, clouds: Sequence[ViewCloud], config: PairConfig) -> None:
+    def __init__(self, clouds: Sequence[ViewCloud], fit: FitConfig) -> None:
         """Keep the views."""
         self.clouds = clouds
-        self.config = config
+        self.fit = fit
         self._maps: dict[int, LocalMap] = {}
 
     def measure(self, first: int, second: int, T_guess: Array) -> Edge:
@@ -282,7 +277,7 @@ class PairMeter:
         """
         a, b = self.clouds[first], self.clouds[second]
         guess = snap_tables(T_guess, a, b)
-        T = snap_tables(self._map(first).align(b.source, guess, self.config.fit), a, b)
+        T = snap_tables(self._map(first).align(b.source, guess, self.fit), a, b)
         overlap, distance = self.agreement(first, second, T)
         return Edge(
             first=first, second=second, T_first_second=T, overlap=overlap, distance_m=distance
@@ -290,31 +285,27 @@ class PairMeter:
 
     def agreement(self, first: int, second: int, T_first_second: Array) -> tuple[float, float]:
         """Return the overlap [share] and mean capped distance [m] of two views at a pose."""
-        d = self._map(first).distances(
-            self.clouds[second].source, T_first_second, self.config.reach_m
-        )
-        return float(np.mean(d < self.config.partner_m)), float(np.mean(d))
+        d = self._map(first).distances(self.clouds[second].source, T_first_second, REACH_M)
+        return float(np.mean(d < PARTNER_M)), float(np.mean(d))
 
     def _map(self, k: int) -> LocalMap:
         """Return the map of view k in its own axes."""
         if k not in self._maps:
-            self._maps[k] = LocalMap(
-                self.clouds[k].target, self.config.voxel_m, self.config.points_per_voxel
-            )
+            self._maps[k] = LocalMap(self.clouds[k].target, VOXEL_M, POINTS_PER_VOXEL)
         return self._maps[k]
 
 
-def view_angles(Ts_world_cam: Array, aim: Array, zoom_deg: float) -> Array:
+def view_angles(Ts_world_cam: Array, aim: Array) -> Array:
     """Return how different the views are (F, F) [deg]: directions to `aim` (3,), and distances."""
     rays = Ts_world_cam[:, :3, 3] - aim
     far = np.linalg.norm(rays, axis=1)
     u = rays / far[:, None]
     angles = np.degrees(np.arccos(np.clip(u @ u.T, -1.0, 1.0)))
-    zoom = zoom_deg * (np.log(far)[:, None] - np.log(far)[None])
+    zoom = ZOOM_DEG * (np.log(far)[:, None] - np.log(far)[None])
     return np.hypot(angles, zoom)
 
 
-def neighbour_pairs(angles: Array, config: PairConfig) -> list[tuple[int, int]]:
+def neighbour_pairs(angles: Array) -> list[tuple[int, int]]:
     """Return pairs of places (i, j), i < j: the tree of nearest views, then each one's next.
 
     The tree joins all views by the shortest steps there are; the second pair of each view tells a
@@ -322,7 +313,6 @@ def neighbour_pairs(angles: Array, config: PairConfig) -> list[tuple[int, int]]:
 
     Args:
         angles: (F, F) of `view_angles`.
-        config: settings.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
 
@@ -337,23 +327,22 @@ def neighbour_pairs(angles: Array, config: PairConfig) -> list[tuple[int, int]]:
             pair = (min(j, k), max(j, k))
             if j == k or pair in pairs:
                 continue
-            if angles[j, k] < config.most_deg:
+            if angles[j, k] < MOST_DEG:
                 pairs.add(pair)
             break
     return sorted(pairs)
 
 
 def further_pairs(
-    angles: Array, known: Sequence[tuple[int, int]], suspects: Sequence[int], each: int,
-    config: PairConfig,
-) -> list[tuple[int, int]]:  # fmt: skip
+    angles: Array, known: Sequence[tuple[int, int]], suspects: Sequence[int], each: int
+) -> list[tuple[int, int]]:
     """Return up to `each` more pairs for every suspect view, the nearest not yet known."""
     pairs, new = set(known), set[tuple[int, int]]()
     for k in suspects:
         added = 0
         for j in np.argsort(angles[k], kind="stable").tolist():
             pair = (min(j, k), max(j, k))
-            if angles[j, k] > config.most_deg or added == each:
+            if angles[j, k] > MOST_DEG or added == each:
                 break
             if j != k and pair not in pairs:
                 pairs.add(pair)
