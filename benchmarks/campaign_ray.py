@@ -17,7 +17,7 @@ from figures import Found
 from school_cases import in_fresh_process
 from school_scaling import CountedWorkers, ScalingJob, ray_nodes, runs
 
-from realsim.app.generate.request import GenerateRequest, claim, made_folder
+from realsim.app.generate.request import GenerateRequest, claim
 from realsim.app.generate.run import scene_tasks
 from realsim.many import PoolConfig, open_pool, run_many
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
@@ -74,10 +74,10 @@ def made(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
             if count == 2:
                 add()
             out = Path(folder) / str(count)
-            made_folder(out)
+            out.mkdir()
             claim(out, request)
             warm = Path(folder) / f"warm{count}"
-            made_folder(warm)
+            warm.mkdir()
             with open_pool(PoolConfig(address=address)) as pool:
                 # Two scenes a node, so that each has loaded everything.
                 run_many(scene_tasks(warm, range(2 * count), request, 1), pool, _silent)

@@ -10,13 +10,15 @@ A full disk is an OSError: the file, and the lines that were there, are as befor
 """
 
 import contextlib
+import csv
 import errno
 import io
 import json
+import math
 import os
 import shutil
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -155,6 +157,16 @@ def json_bytes(value: Any, *, indent: int | None = 1) -> bytes:
 def write_json(path: Path | str, value: Any) -> None:
     """Write plain JSON values whole or not at all."""
     write_bytes(path, json_bytes(value))
+
+
+def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
+    """Return rows as CSV (RFC 4180, UTF-8); what is not known, None or NaN, is an empty cell."""
+    text = io.StringIO(newline="")
+    table = csv.writer(text)
+    table.writerow(header)
+    for row in rows:
+        table.writerow(["" if isinstance(c, float) and math.isnan(c) else c for c in row])
+    return text.getvalue().encode("utf-8")
 
 
 def npz_bytes(**arrays: ArrayLike) -> bytes:

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import click
 
-from realsim.app import command as commands
+from realsim.app import command as command_line
 from realsim.app.option_values import Amount
 from realsim.errors import InputError
 from realsim.untrusted.toml_text import read_toml
@@ -113,7 +113,7 @@ Settings = dict[str, Any]
 """Values by click's name of a parameter; of a group, Settings by the name of a command."""
 
 
-def settings_of(root: commands.Group, file: ConfigFile) -> Settings:
+def settings_of(root: command_line.Group, file: ConfigFile) -> Settings:
     """Return the defaults that a file gives, as click's `default_map` has them.
 
     Raises:
@@ -123,9 +123,9 @@ def settings_of(root: commands.Group, file: ConfigFile) -> Settings:
 
 
 def _of_group(
-    group: commands.Group, path: tuple[str, ...], tables: Mapping[str, Any], file: ConfigFile
+    group: command_line.Group, path: tuple[str, ...], tables: Mapping[str, Any], file: ConfigFile
 ) -> Settings:
-    ctx = commands.context_of(group, path)
+    ctx = command_line.context_of(group, path)
     names = group.list_commands(ctx)
     found: Settings = {}
     for name, value in tables.items():
@@ -139,7 +139,7 @@ def _of_group(
                 f"[{'.'.join(here)}]."
             )
         inner = cast("dict[str, Any]", value)
-        if isinstance(command, commands.Group):
+        if isinstance(command, command_line.Group):
             found[name] = _of_group(command, here, inner, file)
         else:
             found[name] = _of_command(command, here, inner, file)
@@ -163,13 +163,13 @@ def _unknown_table(
 def _of_command(
     command: click.Command, path: tuple[str, ...], table: Mapping[str, Any], file: ConfigFile
 ) -> Settings:
-    options = {commands.spelling(option): option for option in commands.settable(command)}
-    renamed = commands.old_names(command, path)
+    options = {command_line.spelling(option): option for option in command_line.settable(command)}
+    renamed = command_line.old_names(command, path)
     found: Settings = {}
     for key, value in table.items():
         name = key.replace("_", "-")
         if name in renamed:
-            commands.say_renamed(f"{file.place(path, key)}: {key}", renamed[name])
+            command_line.say_renamed(f"{file.place(path, key)}: {key}", renamed[name])
             name = renamed[name]
         option = options.get(name)
         where = f"{file.place(path, key)}: [{'.'.join(path)}]"
@@ -181,7 +181,7 @@ def _of_command(
         assert option.name is not None
         if option.name in found:
             raise InputError(f"{where} sets '{name}' twice; keep one of them.")
-        if value == "" and commands.default_of(option) is None:
+        if value == "" and command_line.default_of(option) is None:
             continue  # "not set", as the template writes it
         found[option.name] = _value(option, value, f"{where} {key}")
     return found

@@ -143,8 +143,8 @@ def _run_of_all(
     for step in campaign.of_all if done else ():
         _require_room(campaign.out)
         with console.stage(step.stage, f"{len(done)} scenes"):
-            words = _words_of_all(campaign, step, done, part)
-            out = Path(words[-1])
+            out = campaign.out.resolve() / f"{step.stage}{part}"
+            words = [*(str(s.folder.resolve()) for s in done), "--out", str(out)]
             before = out.with_name(f"{out.name}.before")
             end = _run(campaign, step, words, where.processes)
             is_refused = not end.is_done and (out / FINISHED).is_file() and not before.exists()
@@ -339,17 +339,9 @@ def _command(step: Step, words: Sequence[str], workers: int) -> Command:
     )
 
 
-def _words_of_all(
-    campaign: Campaign, step: Step, done: Sequence[SceneState], part: str
-) -> list[str]:
-    """Return what a stage over all scenes takes and fills."""
-    out = campaign.out.resolve() / f"{step.stage}{part}"
-    return [*(str(s.folder.resolve()) for s in done), "--out", str(out)]
-
-
 def _run(campaign: Campaign, step: Step, words: Sequence[str], workers: int) -> Ended:
-    command = _command(step, words, workers)
     folder = _folder(campaign)
+    command = _command(step, words, workers)
     return run_command(command, folder, folder, _log(campaign, step.stage))
 
 

@@ -88,11 +88,6 @@ class SessionMotions:
         grasps, models = stored_grasps(folder)
         return cls(grasps, models, cache=folder / GRASPS / "cache", with_arm=with_arm)
 
-    def warm(self) -> None:
-        """Read the arm's meshes: 3 s that the first click need not wait for."""
-        if self._with_arm:
-            hand_meshes(find_hand(), np.eye(4)[None], np.zeros(1))
-
     def motion(self, instance: int, row: int) -> GraspMotion | None:
         """Return the motion of a grasp; None where there is no such grasp, or its object no pose.
 

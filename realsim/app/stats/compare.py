@@ -24,6 +24,7 @@ from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.formats.session_scene import SessionScene
 from realsim.geometry import se3
 from realsim.records import GraspSet
+from realsim.review.corrections import apart
 
 MOVED_MM, MOVED_DEG = 1e-3, 1e-3
 """A pose that differs by less is the same: files round."""
@@ -188,7 +189,7 @@ def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
             T_old, T_new = (
                 f.objects[rows[thing]].T_cam_obj for f, rows in ((a, rows_old), (b, rows_new))
             )
-            mm, deg = _moved(T_old, T_new)
+            mm, deg = apart(T_old, T_new)
             if mm > MOVED_MM or deg > MOVED_DEG:
                 worst = found.moved.get(thing, (0.0, 0.0))
                 found.moved[thing] = (max(mm, worst[0]), max(deg, worst[1]))
@@ -236,12 +237,6 @@ def _rows(frame: LabelledFrame, names: dict[int, str]) -> dict[Thing, int]:
     return rows
 
 
-def _moved(T_old: Array, T_new: Array) -> tuple[float, float]:
-    """Return how far a pose is from another [mm], [deg]."""
-    off = se3.invert(T_old) @ T_new
-    return 1e3 * float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-
-
 def _is_other_camera(old: LabelledFrame, new: LabelledFrame) -> bool:
     a, b = old.intrinsics, new.intrinsics
     if (a.width, a.height) != (b.width, b.height) or old.depth_unit_m != new.depth_unit_m:
@@ -253,7 +248,7 @@ def _is_other_camera(old: LabelledFrame, new: LabelledFrame) -> bool:
     Ts = (old.T_world_cam, new.T_world_cam)
     if Ts[0] is None or Ts[1] is None:
         return Ts[0] is not Ts[1]
-    mm, deg = _moved(Ts[0], Ts[1])
+    mm, deg = apart(Ts[0], Ts[1])
     return mm > MOVED_MM or deg > MOVED_DEG
 
 

@@ -3,8 +3,6 @@
 A row for our data set in the paper's two tables of comparison with other data sets.
 """
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -203,16 +201,6 @@ def _records(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> list[dict
     return [json_value(dict(zip(header, row, strict=True))) for row in rows]
 
 
-def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> bytes:
-    """Return rows as CSV (RFC 4180, UTF-8); what is not known is an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer)
-    writer.writerow(header)
-    for row in rows:
-        writer.writerow(["" if isinstance(c, float) and math.isnan(c) else c for c in row])
-    return buffer.getvalue().encode("utf-8")
-
-
 def _write_all(
     out: Path, stats: Statistics, document: dict[str, Any], notes: list[str], console: Console
 ) -> None:
@@ -224,7 +212,7 @@ def _write_all(
     )
     atomic.write_json(out / DOCUMENT, document)  # first: by it the folder is known as ours
     for name, (header, rows) in zip(TABLES, tables, strict=True):
-        atomic.write_bytes(out / name, csv_bytes(header, rows))
+        atomic.write_bytes(out / name, atomic.csv_bytes(header, rows))
     _write_page(out / PAGE, stats, notes)
     for name in (*TABLES, DOCUMENT, PAGE):
         console.say(f"written   {out / name}")

@@ -1,7 +1,5 @@
 """What an upgrade found, scene by scene and object by object: on the console, as JSON and CSV."""
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -123,13 +121,11 @@ def write_tables(
         "left_out": dict(failed), "analytic": analytic,
     }  # fmt: skip
     atomic.write_json(out / JSON_FILE, document)
-    text = io.StringIO(newline="")
-    table = csv.writer(text)
-    table.writerow(COLUMNS)
+    rows: list[list[object]] = []
     for record, o in objects_of(records):
         flat = {**o, **o["grasps"], "scene": record["place"], "reasons": "; ".join(o["reasons"])}
-        table.writerow(["" if flat[c] is None else flat[c] for c in COLUMNS])
-    atomic.write_bytes(out / CSV_FILE, text.getvalue().encode("utf-8"))
+        rows.append([flat[c] for c in COLUMNS])
+    atomic.write_bytes(out / CSV_FILE, atomic.csv_bytes(COLUMNS, rows))
 
 
 def show_upgrade(result: "UpgradeResult", console: Console) -> None:
