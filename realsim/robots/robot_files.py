@@ -163,7 +163,9 @@ def _folder(name: str, kind: Kind) -> Path:
         # A folder that is called so, or whose file says so: plans keep the name of the file.
         paths = [p for root in _shelves() for p in _on_shelf(root, kind)]
         found = [p for p in paths if same_name(p.name, name)]
-        found += [p for p in paths if p not in found and same_name(_name_in(p), name)]
+        found += [
+            p for p in paths if p not in found and same_name(str(_said(p / FILE, "name")), name)
+        ]
         if len(found) > 1:
             raise InputError(
                 f"more than one {kind} is called '{name[:80]}': "
@@ -184,11 +186,7 @@ def _folder(name: str, kind: Kind) -> Path:
 
 
 def _on_shelf(root: Path, kind: Kind) -> list[Path]:
-    return [f.parent for f in sorted(root.glob(f"*/{FILE}")) if _kind_of(f) == kind]
-
-
-def _name_in(folder: Path) -> str:
-    return str(read_toml(folder / FILE)[1].get("name"))
+    return [f.parent for f in sorted(root.glob(f"*/{FILE}")) if _said(f, "kind") == kind]
 
 
 def _known(kind: Kind) -> str:
@@ -207,9 +205,9 @@ def _shelves() -> list[Path]:
     return [*own, SHIPPED]
 
 
-def _kind_of(file: Path) -> Any:
+def _said(file: Path, key: str) -> Any:
     try:
-        return read_toml(file)[1].get("kind")
+        return read_toml(file)[1].get(key)
     except InputError:
         return None  # told when it is asked for by name
 

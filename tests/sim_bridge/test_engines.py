@@ -64,7 +64,7 @@ def crawl_mm(settings):
     """Return how far an object crawls in a second that is squeezed, and nothing else."""
     trial = askew(3)
     grips = trial.grips(headroom_m=1.0)
-    with BulletEngine(settings).world(trial.body, grips, SlipPhysics(), find_hand()) as world:
+    with BulletEngine(settings).world(trial.met(SlipPhysics(), find_hand()), grips) as world:
         world.close(Closing())
         seen = world.play(np.zeros((3, 240, 6)), 60, 1.0).Ts_world_body[:, :, :3, 3]
     return 1e3 * np.linalg.norm(seen[:, -1] - seen[:, 0], axis=-1).max()
@@ -106,7 +106,7 @@ def test_pads_are_as_stiff_as_they_are_told_whatever_they_hold(engine, mass, ask
     engine = make_engine(settings_of(engine))
     for force_n in (20.0, 70.0):
         physics = SlipPhysics(force_n=force_n, pads=PadModel(pad_stiffness_n_per_m=asked))
-        with engine.world(trial.body, trial.grips(0.004), physics, find_hand()) as world:
+        with engine.world(trial.met(physics, find_hand()), trial.grips(0.004)) as world:
             world.close(Closing())
             still = round(0.3 / world.dt)
             world.play(np.zeros((1, still, 6)), still, 1.0)
@@ -121,9 +121,8 @@ def test_a_stiffness_that_cannot_be_is_refused_with_what_can():
     soft = PadModel(pad_stiffness_n_per_m=2e4)
     refused(r"4\.667e\+04 N/m or more .* 30 N or less", SlipPhysics, force_n=70.0, pads=soft)
     trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.1)
-    physics = SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5))
-    world = make_engine(long).world
-    refused("shorter step_s", world, trial.body, trial.grips(0.004), physics, find_hand())
+    met = trial.met(SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5)), find_hand())
+    refused("shorter step_s", make_engine(long).world, met, trial.grips(0.004))
 
 
 def test_pads_of_an_arc_are_where_it_has_them_while_they_close():
@@ -134,7 +133,7 @@ def test_pads_of_an_arc_are_where_it_has_them_while_they_close():
     np.testing.assert_allclose(law(y), hand.z_pad(2 * y), atol=5e-5)
     grips = replace(trial.grips(0.004), openings_m=np.array([0.12]))
     bullet = BulletEngine(BulletSettings())
-    with bullet.world(trial.body, grips, SlipPhysics.of(hand), hand) as world:
+    with bullet.world(trial.met(SlipPhysics.of(hand), hand), grips) as world:
         pair = world._pair
         world._take(0)
         pair.drive(0.1)
@@ -172,8 +171,8 @@ def body_of(parts, mass_kg, center):
 def standing(engine, corners, stand, physics=None, closing=None, off_m=0.0, parts=None):
     """Return what a hand that closes from above at z = 2 cm does to a body of 100 g, in steps."""
     body = body_of(parts or (corners,), 0.1, corners.mean(axis=0))
-    made = make_engine(settings_of(engine))
-    with made.world(body, gripped(off_m), physics or SlipPhysics(), find_hand(), stand) as world:
+    met = replace(askew(1), body=body, stand=stand).met(physics or SlipPhysics(), find_hand())
+    with make_engine(settings_of(engine)).world(met, gripped(off_m)) as world:
         start = world.states().Ts_world_body[0]
         motion = world.close(closing or Closing())
     return start, motion.Ts_world_body[0], motion.finger_n[0]
@@ -207,7 +206,8 @@ def test_a_body_of_parts_is_pushed_over_the_table_as_one(engine):
 
 def test_the_hull_alone_stands_on_the_table_of_bullet():
     body, bullet = body_of(COLUMNS, 0.5, np.array([0, 0, 0.02])), BulletEngine(BulletSettings())
-    with bullet.world(body, gripped(0.2), SlipPhysics(), find_hand(), table()) as world:
+    met = replace(askew(1), body=body, stand=table()).met(SlipPhysics(), find_hand())
+    with bullet.world(met, gripped(0.2)) as world:
         pair, far = world._pair, se3.from_translation([0.0, 0.0, 1.0])
         pair.place_stand(world._Ts_hand_table[0])
         world._take(0)

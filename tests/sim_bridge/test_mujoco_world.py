@@ -11,7 +11,7 @@ from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
 from realsim_sim_bridge.slip.mujoco_world import MujocoEngine
-from realsim_sim_bridge.slip.world import Closing, Grips, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Grips, Meeting, SlipPhysics
 from refusals import refused
 
 CENTRED = np.eye(4)[None]
@@ -35,7 +35,7 @@ def scattered(n, seed=0):
 
 
 def world(body=CUBE, given=None, physics=None, engine=ENGINE):
-    return engine.world(body, given or grips(), physics or SlipPhysics(), find_hand())
+    return engine.world(Meeting(body, physics or SlipPhysics(), find_hand()), given or grips())
 
 
 def constant(force, steps, n=1):

@@ -11,7 +11,7 @@ from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
-from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Grips, Meeting, PadModel, SlipPhysics
 from realsim_sim_bridge.validation.config import LabelConfig, ValidationConfig
 from realsim_sim_bridge.validation.full_arm import carry_cube, stage_joints
 from realsim_sim_bridge.validation.loads import hand_patch, hold, with_hand
@@ -40,7 +40,7 @@ GRIPS = Grips(
 
 def closed(body, physics=EDGE.physics, settings=None):
     """Return a world of one hand that has closed on a body, with its origin between the pads."""
-    world = ReferenceEngine(settings).world(body, GRIPS, physics, HAND)
+    world = ReferenceEngine(settings).world(Meeting(body, physics, HAND), GRIPS)
     world.close(Closing())
     return world
 
@@ -80,7 +80,7 @@ def test_no_sphere_takes_the_far_side_of_a_sharp_edge_for_its_own():
     # sphere's centre from below.
     trial = edge_trial("cone", 1.1, 12, 7, HAND, lean_deg=20.0).part(slice(6, 7))
     grips = trial.grips(EDGE.headroom_m)
-    with ReferenceEngine().world(trial.body, grips, EDGE.physics, HAND) as world:
+    with ReferenceEngine().world(trial.met(EDGE.physics, HAND), grips) as world:
         world.close(Closing())
         assert world.deepest_m.max() < 1e-3
 
@@ -175,11 +175,11 @@ def test_a_ball_rolls_between_flat_pads_and_does_not_slip_along_them():
 
 def test_no_pads_a_flat_part_and_a_table_are_named():
     world, bare = ReferenceEngine().world, SlipPhysics(pads=None)
-    refused(r"sphere pads.*PadModel\.of", world, cube(0.1), GRIPS, bare, HAND)
+    refused(r"sphere pads.*PadModel\.of", world, Meeting(cube(0.1), bare, HAND), GRIPS)
     stand = Stand(height_m=0.0, friction=0.4, gravity=9.81)
-    refused("free objects", world, cube(0.1), GRIPS, EDGE.physics, HAND, stand)
+    refused("free objects", world, Meeting(cube(0.1), EDGE.physics, HAND, stand), GRIPS)
     flat = replace(cube(0.1), parts=(np.eye(4)[:, :3] * [1.0, 1.0, 0.0],))
-    refused("has no volume", world, flat, GRIPS, EDGE.physics, HAND)
+    refused("has no volume", world, Meeting(flat, EDGE.physics, HAND), GRIPS)
 
 
 # --- The suite's specimens, its loads, and the arm that carries a cube.

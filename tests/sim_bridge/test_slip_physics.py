@@ -73,7 +73,7 @@ def hold(load_share, force_n, friction, direction):
     physics = SlipPhysics(force_n=force_n, friction=friction)
     t = trial(mass=0.3)
     engine = BulletEngine(BulletSettings())
-    with engine.world(t.body, t.grips(0.004), physics, find_hand()) as world:
+    with engine.world(t.met(physics, find_hand()), t.grips(0.004)) as world:
         closed = world.close(Closing())
         assert np.allclose(closed.finger_n[0, -1], force_n, rtol=0.02)
         start = world.states().Ts_world_body
@@ -145,7 +145,7 @@ def test_what_slips_in_a_fast_replay_is_judged_at_true_speed():
 
 def test_every_setting_is_read_back_from_the_engine():
     t, physics, settings = trial(mass=0.013), SlipPhysics(friction=0.37), BulletSettings()
-    with BulletEngine(settings).world(t.body, t.grips(0.004), physics, find_hand()) as world:
+    with BulletEngine(settings).world(t.met(physics, find_hand()), t.grips(0.004)) as world:
         world.close(Closing())
         read = world.settings()
     assert read["object_friction"] == pytest.approx(0.37) and read["finger_friction"] == 1.0
@@ -160,7 +160,7 @@ def test_states_put_back_go_on_alike():
     engine = BulletEngine(BulletSettings())
     pull = np.zeros((2, 60, 6))
     pull[:, :, 5] = -1.2
-    with engine.world(t.body, t.grips(0.004), SlipPhysics(), find_hand()) as world:
+    with engine.world(t.met(SlipPhysics(), find_hand()), t.grips(0.004)) as world:
         world.close(Closing())
         before = world.states()
         first = world.play(pull, 20, 1.0).Ts_world_body

@@ -65,9 +65,9 @@ class StrongerEngine:
     def __getattr__(self, name):
         return getattr(self._engine, name)
 
-    def world(self, body, grips, physics, geometry, stand=None):
-        stronger = replace(physics, force_n=1.5 * physics.force_n)
-        return self._engine.world(body, grips, stronger, geometry, stand)
+    def world(self, met, grips):
+        stronger = replace(met.physics, force_n=1.5 * met.physics.force_n)
+        return self._engine.world(replace(met, physics=stronger), grips)
 
 
 # --- what must be green --------------------------------------------------------------------------

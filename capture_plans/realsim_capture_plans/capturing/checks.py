@@ -167,9 +167,7 @@ def _check(name: str, reason: str, value: str, mark: Mark = "doubt") -> Check:
 
 def check_still(before: ArmState, after: ArmState) -> Check:
     """Did the flange stand still during the exposure?"""
-    moved = se3.invert(before.T_base_ee) @ after.T_base_ee
-    mm = 1e3 * float(np.linalg.norm(moved[:3, 3]))
-    deg = float(np.degrees(se3.angle(moved)))
+    mm, deg = pose_gap(before.T_base_ee, after.T_base_ee)
     wrong = mm > MOTION_MM or deg > MOTION_DEG
     reason = f"the flange moved {mm:.2f} mm, {deg:.3f} deg during the exposure" if wrong else ""
     return _check("still", reason, f"{mm:.2f} mm", "fault")
@@ -261,19 +259,15 @@ def check_clock(frame: Frame, state: ArmState, before: Earlier | None) -> Check:
     return _check("clock", reason, f"{frame.time_s:.2f} s", "fault")
 
 
-def pose_gap(state: ArmState, T_base_ee: Array) -> tuple[float, float]:
-    """Return how far the controller's flange is from another pose (4, 4) [mm], [deg]."""
-    return _step(T_base_ee, state.T_base_ee)
-
-
-def _step(T_from: Array, T_to: Array) -> tuple[float, float]:
+def pose_gap(T_from: Array, T_to: Array) -> tuple[float, float]:
+    """Return how far two poses (4, 4) are apart [mm], [deg]."""
     step = se3.invert(T_from) @ T_to
     return 1e3 * float(np.linalg.norm(step[:3, 3])), float(np.degrees(se3.angle(step)))
 
 
 def check_pose(state: ArmState, T_base_ee: Array) -> Check:
     """Does the plan's chain put the flange where the controller says it is?"""
-    mm, deg = pose_gap(state, T_base_ee)
+    mm, deg = pose_gap(T_base_ee, state.T_base_ee)
     wrong = (
         f"the controller's flange pose is {mm:.1f} mm, {deg:.2f} deg from the plan's chain: give "
         "the controller's calibration.conf when the plan is made. The poses stored are the "
@@ -284,7 +278,7 @@ def check_pose(state: ArmState, T_base_ee: Array) -> Check:
 
 def check_tool(state: ArmState, T_ee_tcp: Array) -> Check:
     """Is the controller's tool offset what it was at the first view?"""
-    mm, deg = _step(T_ee_tcp, state.T_ee_tcp)
+    mm, deg = pose_gap(T_ee_tcp, state.T_ee_tcp)
     wrong = (
         f"the controller's tool offset changed by {mm:.1f} mm, {deg:.2f} deg since the first view; "
         "the flange poses stored do not depend on it, programs at the pendant do"

@@ -237,7 +237,7 @@ class Looker:
         self._require_goal(k, after)
         intrinsics = self._camera.intrinsics
         found, numbers = self._judged(before, after, frame, (intrinsics.height, intrinsics.width))
-        gap_mm, _ = checks.pose_gap(after, self._plan.chain.forward(after.joints))
+        gap_mm, _ = checks.pose_gap(self._plan.chain.forward(after.joints), after.T_base_ee)
         return Shot(
             state=after, frame=frame, numbers=numbers, checks=found, waited_s=waited,
             pose_mm=gap_mm,
@@ -304,10 +304,10 @@ def check_arm(plan: CapturePlan, arm: Arm) -> ArmState:
             f"the plan, made for a {plan.robot}, leaves the joint limits of {arm.name}. {remedy}"
         )
     state = arm.state()
-    gap_mm, _ = checks.pose_gap(state, plan.chain.forward(state.joints))
+    gap_mm, _ = checks.pose_gap(plan.chain.forward(state.joints), state.T_base_ee)
     if gap_mm > WRONG_ARM_MM:
         alike = known_chains(len(state.joints)).items()
-        gaps = {n: checks.pose_gap(state, c.forward(state.joints))[0] for n, c in alike}
+        gaps = {n: checks.pose_gap(c.forward(state.joints), state.T_base_ee)[0] for n, c in alike}
         likely = min(gaps, key=lambda name: gaps[name])
         hint = f" It moves like a {likely}." if gaps[likely] < WRONG_ARM_MM else ""
         raise InputError(

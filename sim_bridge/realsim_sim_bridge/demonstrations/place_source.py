@@ -97,14 +97,12 @@ class PlacingSource(DemonstrationSource):
             return None
         goals = list(goals_of(self.standing, name.instance, number))
         lowest = float(self.standing.corners[name.instance][:, 2].min())
+        lift_m = self._configs[name.instance].reach.lift_m
         for k in range(len(goals)):
             goal = goals[(number + k) % len(goals)]
-            if self._path(joints, goal.shift_m, self._lift_m(name) - lowest) is not None:
+            if self._path(joints, goal.shift_m, lift_m - lowest) is not None:
                 return goal
         return None
-
-    def _lift_m(self, name: AttemptName) -> float:
-        return self._configs[name.instance].reach.lift_m
 
     def _lifted(self, name: AttemptName) -> tuple[Int64, Array]:
         """Return the phases of an attempt's samples, and the joints (n,) at the lift's end."""

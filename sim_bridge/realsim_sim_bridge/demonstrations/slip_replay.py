@@ -13,13 +13,12 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
-from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import NOT_SIMULATED, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
-from realsim_sim_bridge.slip.world import Engine, Grips, HandWorld, Motion, SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import Engine, Grips, HandWorld, Meeting, Motion, SlipBody
 
 # --- An engine of the slip test that writes down where the objects were --------------------------
 # It stands between the slip test and a real engine and passes everything on unchanged, so that a
@@ -54,14 +53,7 @@ class RecordedEngine(Engine):
         self.stages = []
         self._worlds = 0
 
-    def world(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        stand: Stand | None = None,
-    ) -> HandWorld:
+    def world(self, met: Meeting, grips: Grips) -> HandWorld:
         """Return the engine's world, whose plays are written down.
 
         The slip test's first world goes through the stages; a later one plays its latest stage
@@ -69,7 +61,7 @@ class RecordedEngine(Engine):
         """
         self._worlds += 1
         again = self._worlds > 1
-        world = self._engine.world(body, grips, physics, geometry, stand)
+        world = self._engine.world(met, grips)
         close, play = world.close, world.play
 
         def noted(motion: Motion, speed: int) -> Motion:

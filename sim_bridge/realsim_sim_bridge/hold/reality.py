@@ -114,7 +114,7 @@ class Reality:
 
 def judge_trials(
     objects: Sequence[TriedObject],
-    config: RealityConfig | None = None,
+    config: RealityConfig,
     cache: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Judged:
@@ -129,7 +129,6 @@ def judge_trials(
     Raises:
         InputError: there is no trial, or an engine is not installed.
     """
-    config = config or RealityConfig()
     total = sum(len(o.held) for o in objects)
     if total == 0:
         raise InputError("there are no trials to judge by; grasps with a result each are needed.")

@@ -1,6 +1,6 @@
 """A day at school: every object's preparation, then its grasps in shards, on whatever workers."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -171,6 +171,11 @@ class Pupil:
         return self.path(f"shard_{int(rows[0]):06d}")
 
 
+def so_far(pupils: Sequence[Pupil]) -> tuple[int, int]:
+    """Return how many grasps are judged, and how many there are."""
+    return sum(p.judged for p in pupils), sum(p.expected for p in pupils)
+
+
 class Day:
     """Hands out preparations and shards; this process alone writes the files."""
 
@@ -238,8 +243,7 @@ class Day:
     def _report(self) -> None:
         """Tell how many grasps are judged."""
         if self._progress is not None:
-            judged = sum(pupil.judged for pupil in self._pupils)
-            self._progress(judged, sum(pupil.expected for pupil in self._pupils))
+            self._progress(*so_far(self._pupils))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -14,7 +14,7 @@ from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
 from realsim_sim_bridge.grasping.surroundings import standing_object, together
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.day import Day, Progress, Pupil
+from realsim_sim_bridge.school.day import Day, Progress, Pupil, so_far
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask
 from realsim_sim_bridge.school.run_record import Restart, folder_of_run, mark_finished, run_record
@@ -81,7 +81,7 @@ def run_school_results(  # noqa: PLR0913 - keywords, each with a meaning of its 
                 with open_pool(workers) as pool:
                     Day(pool, pupils, progress).run()
             elif progress is not None:
-                progress(*_progress(pupils))
+                progress(*so_far(pupils))
         except KeyboardInterrupt as stop:
             raise type(stop)(f"interrupted {_how_to_go_on(pupils, cache)}") from None
         except ClusterLostError as error:
@@ -109,14 +109,9 @@ def _grasp_sets(run: Callable[P, list[SchoolResult]]) -> Callable[P, list[GraspS
 run_school = _grasp_sets(run_school_results)
 
 
-def _progress(pupils: list[Pupil]) -> tuple[int, int]:
-    """Return how many grasps are judged and how many will be."""
-    return sum(p.judged for p in pupils), sum(p.expected for p in pupils)
-
-
 def _how_to_go_on(pupils: list[Pupil], cache: Path | None) -> str:
     """Return what is left after an interruption."""
-    judged, expected = _progress(pupils)
+    judged, expected = so_far(pupils)
     done = f"after {judged} of {expected} grasps"
     if cache is None:
         return f"{done}; nothing of it is kept, as no cache folder was given."

@@ -132,7 +132,7 @@ def run_sweep(
     limits: ScoreLimits,
     geometry: Hand,
     engine: Engine,
-    sweep: SweepConfig | None = None,
+    sweep: SweepConfig,
 ) -> Sweep:
     """Return the scores of a trial's grasps at every level that was tried.
 
@@ -145,7 +145,6 @@ def run_sweep(
         engine: that of the slip test.
         sweep: the levels.
     """
-    sweep = sweep or SweepConfig()
     known = slips.scores(limits)[1]
     physics, pads = config.physics, config.physics.pads
 

@@ -28,7 +28,7 @@ from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip import bullet_shapes
 from realsim_sim_bridge.slip.stand import Stand
-from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import Meeting
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import BulletSettings
@@ -56,14 +56,7 @@ box starts with 27 mm/s."""
 class BulletPair:
     """A hand fixed at the origin, in the grasp frame's axes, and an object."""
 
-    def __init__(
-        self,
-        body: SlipBody,
-        physics: SlipPhysics,
-        geometry: Hand,
-        settings: "BulletSettings",
-        stand: Stand | None = None,
-    ) -> None:
+    def __init__(self, met: Meeting, settings: "BulletSettings") -> None:
         """Build the pair, and what the object stands on while the fingers close.
 
         Raises:
@@ -72,10 +65,11 @@ class BulletPair:
         self.engine = interop.pybullet_client()
         # When Python ends, its modules may be gone before this object: a finalizer runs earlier.
         weakref.finalize(self, _disconnect, self.engine)
-        self._physics, self._settings = physics, settings
+        self.met, body, stand = met, met.body, met.stand
+        self._physics, self._settings, self._geometry = met.physics, settings, met.geometry
         self.dt = 1.0 / settings.rate_hz
         self._T_obj_body, moments = body.principal_frame()
-        self._mass = max(body.mass_kg, physics.mass_floor_kg)
+        self._mass = max(body.mass_kg, met.physics.mass_floor_kg)
         self._moments = moments * (self._mass / body.mass_kg)
         self.engine.setPhysicsEngineParameter(
             fixedTimeStep=self.dt,
@@ -85,9 +79,8 @@ class BulletPair:
             frictionERP=settings.friction_erp,
         )
         self.engine.setGravity(0.0, 0.0, 0.0)
-        self._geometry = geometry
         with tempfile.TemporaryDirectory() as folder:
-            self.hand = self._add_hand(Path(folder), geometry)
+            self.hand = self._add_hand(Path(folder), met.geometry)
             T_body_obj = se3.invert(self._T_obj_body)
             parts = [se3.transform(T_body_obj, part) for part in body.parts]
             cores, margin = bullet_shapes.drawn_in(parts, settings.collision_margin_m)
@@ -99,7 +92,6 @@ class BulletPair:
                     whole = self._shape(hull, Path(folder) / "hull.obj")
             self.object = self._add_object(shape, margin, whole)
             self._stands = [] if stand is None else self._add_stand(stand, Path(folder))
-        self.stand = stand
         self.reach_m = body.reach()
         gravity = 0.0 if stand is None else stand.gravity
         self.weights_n = gravity * self._mass, gravity * body.mass_kg
@@ -239,8 +231,8 @@ class BulletPair:
             if T_hand_table is not None:
                 T = T_hand_table
                 if n == 0:
-                    assert self.stand is not None, "a table is a stand's"
-                    top = self.stand.height_m - TABLE_M[2] / 2.0
+                    assert self.met.stand is not None, "a table is a stand's"
+                    top = self.met.stand.height_m - TABLE_M[2] / 2.0
                     T = T @ se3.from_translation([*se3.invert(T)[:2, 3], top])
                 position, xyzw = interop.pybullet_from_T(T)
             self._placed.append((body, np.array(position), xyzw))

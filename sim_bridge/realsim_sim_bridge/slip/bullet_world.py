@@ -6,18 +6,15 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim.geometry import se3
-from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
-from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
     Grips,
     HandWorld,
+    Meeting,
     Motion,
     PairStates,
-    SlipBody,
-    SlipPhysics,
 )
 
 if TYPE_CHECKING:
@@ -34,46 +31,33 @@ class BulletEngine(Engine):
     def __init__(self, settings: "BulletSettings") -> None:
         """Keep the settings."""
         self.settings = settings
-        self._kept: tuple[SlipBody, SlipPhysics, Hand, BulletPair] | None = None
+        self._kept: BulletPair | None = None
 
-    def world(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        stand: Stand | None = None,
-    ) -> "BulletWorld":
-        """Return a world with these pairs."""
-        return BulletWorld(self._pair(body, physics, geometry, stand), body, grips, physics)
+    def world(self, met: Meeting, grips: Grips) -> "BulletWorld":
+        """Return a world with these pairs; their pair is built if it is another than the last."""
+        pair = self._kept
+        if pair is None or not _same(pair.met, met):
+            pair = self._kept = BulletPair(met, self.settings)
+        return BulletWorld(pair, grips)
 
-    def _pair(
-        self, body: SlipBody, physics: SlipPhysics, geometry: Hand, stand: Stand | None
-    ) -> BulletPair:
-        """Return the pair of this body, built if it is another one than the last."""
-        if self._kept is not None:
-            kept_body, kept_physics, kept_geometry, pair = self._kept
-            same = kept_body is body and pair.stand is stand
-            if same and kept_physics == physics and kept_geometry == geometry:
-                return pair
-        pair = BulletPair(body, physics, geometry, self.settings, stand)
-        self._kept = (body, physics, geometry, pair)
-        return pair
+
+def _same(a: Meeting, b: Meeting) -> bool:
+    """Return whether the very body and stand meet, under equal laws in equal hands."""
+    equal = (a.physics, a.geometry) == (b.physics, b.geometry)
+    return equal and a.body is b.body and a.stand is b.stand
 
 
 class BulletWorld(HandWorld):
     """K pairs of hand and object; a `HandWorld`. Other worlds may be played in the same pair."""
 
-    def __init__(
-        self, pair: BulletPair, body: SlipBody, grips: Grips, physics: SlipPhysics
-    ) -> None:
+    def __init__(self, pair: BulletPair, grips: Grips) -> None:
         """Put nothing into the engine yet; the interface is described in `world.py`."""
         n = len(grips.openings_m)
-        self._pair, self._physics = pair, physics
+        self._pair, self._physics = pair, pair.met.physics
         self.dt = pair.dt
         self._Ts_hand_table = se3.invert(grips.Ts_table_grasp)
         self._R_world_hand = grips.Ts_table_grasp[:, :3, :3]
-        self._Ts_hand_body = se3.invert(grips.Ts_obj_grasp) @ body.principal_frame()[0]
+        self._Ts_hand_body = se3.invert(grips.Ts_obj_grasp) @ pair.met.body.principal_frame()[0]
         self._twists = np.zeros((n, 6))
         self._fingers = np.repeat(grips.openings_m[:, None] / 2.0, 2, axis=1)
         self._speeds = np.zeros((n, 2))
@@ -86,7 +70,7 @@ class BulletWorld(HandWorld):
         """Close all hands; see `HandWorld`. Each pair ends where it came to rest."""
         sample = max(1, round(closing.sample_s / self.dt))
         pair = self._pair
-        pair.drag(closing.drag_per_s if pair.stand is None else 0.0)
+        pair.drag(closing.drag_per_s if pair.met.stand is None else 0.0)
         pair.anchor(False)
         seen = [
             self._close(k, closing, sample) if self.alive[k] else [] for k in range(len(self.alive))
@@ -104,7 +88,7 @@ class BulletWorld(HandWorld):
         pair.drive(closing.speed)
         down = -self._R_world_hand[k, 2]
         duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
-        most = 0 if pair.stand is None else round(closing.release_s / (sample * self.dt))
+        most = 0 if pair.met.stand is None else round(closing.release_s / (sample * self.dt))
         sunk, weight = -1, (pair.weights_n[0] * down).tolist()
         before, fingers = self._Ts_hand_body[k], self._fingers[k]
         start = before[:3, 3]
@@ -115,7 +99,7 @@ class BulletWorld(HandWorld):
                     far = closing.release_speed * self.dt * (sunk * sample + step)
                     pair.sink_stand(far * down)
                 pair.follow_arc()
-                if pair.stand is not None:
+                if pair.met.stand is not None:
                     pair.push([0.0, 0.0, 0.0], weight)
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))

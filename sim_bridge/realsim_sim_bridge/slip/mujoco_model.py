@@ -27,7 +27,7 @@ from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.mujoco_pads import PAD_PRIORITY, set_pads
 from realsim_sim_bridge.slip.stand import Stand
-from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import Meeting, PadModel, SlipPhysics
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import MujocoSettings
@@ -88,19 +88,14 @@ def load_mujoco() -> Any:
     return module
 
 
-def compile_pair(
-    body: SlipBody,
-    physics: SlipPhysics,
-    geometry: Hand,
-    settings: "MujocoSettings",
-    stand: Stand | None = None,
-) -> PairModel:
+def compile_pair(met: Meeting, settings: "MujocoSettings") -> PairModel:
     """Compile the model.
 
     Raises:
         InputError: MuJoCo refuses the object.
     """
     mujoco = load_mujoco()
+    body, physics, geometry, stand = met.body, met.physics, met.geometry, met.stand
     T_obj_body, moments = body.principal_frame()
     spec: Any = mujoco.MjSpec()
     _set_options(spec, physics, settings)

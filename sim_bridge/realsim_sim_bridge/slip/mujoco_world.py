@@ -15,7 +15,6 @@ import numpy as np
 from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip import mujoco_state
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (
@@ -32,6 +31,7 @@ from realsim_sim_bridge.slip.world import (
     Engine,
     Grips,
     HandWorld,
+    Meeting,
     Motion,
     PairStates,
     SlipBody,
@@ -62,33 +62,19 @@ class MujocoEngine(Engine):
         self.settings = settings
         self._models: OrderedDict[str, PairModel] = OrderedDict()
 
-    def world(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        stand: Stand | None = None,
-    ) -> HandWorld:
+    def world(self, met: Meeting, grips: Grips) -> HandWorld:
         """Return a world with these pairs.
 
         Raises:
             InputError: MuJoCo refuses the object.
         """
-        pair = self.pair(body, physics, geometry, stand)
-        return MujocoWorld(pair, grips, physics, self.settings)
-
-    def pair(
-        self, body: SlipBody, physics: SlipPhysics, geometry: Hand, stand: Stand | None = None
-    ) -> PairModel:
-        """Return the compiled model, from those kept if it is there."""
-        key = _content(body, physics, geometry, stand)
+        key = _content(met.body, met.physics, met.geometry, met.stand)
         if key not in self._models:
-            self._models[key] = compile_pair(body, physics, geometry, self.settings, stand)
+            self._models[key] = compile_pair(met, self.settings)
         self._models.move_to_end(key)
         while len(self._models) > MODELS_KEPT:
             self._models.popitem(last=False)
-        return self._models[key]
+        return MujocoWorld(self._models[key], grips, met.physics, self.settings)
 
 
 class MujocoWorld(HandWorld):

@@ -29,6 +29,7 @@ from realsim_sim_bridge.slip.world import (
     Engine,
     Grips,
     HandWorld,
+    Meeting,
     Motion,
     PairStates,
     Replay,
@@ -108,6 +109,10 @@ class SlipTrial:
     def part(self, rows: slice | Rows | Mask) -> "SlipTrial":
         """Return the trial of some of the grasps."""
         return rows_of(self, rows)
+
+    def met(self, physics: SlipPhysics, geometry: Hand) -> Meeting:
+        """Return what meets in its pairs."""
+        return Meeting(self.body, physics, geometry, self.stand)
 
     def grips(self, headroom_m: float) -> Grips:
         """Return where the hands are, fingers no farther outside the object than `headroom_m`."""
@@ -196,6 +201,7 @@ class _SlipTest:
     ) -> None:
         self._trial, self._config, self._limits = trial, config, limits
         self._geometry, self._engine = geometry, engine
+        self._met = trial.met(config.physics, geometry)
         self._grips = trial.grips(config.headroom_m)
         n = len(trial)
         shape = (n, len(STAGES))
@@ -337,13 +343,7 @@ class _SlipTest:
 
     def _world(self, rows: Rows) -> HandWorld:
         """Return a world of some rows."""
-        return self._engine.world(
-            self._trial.body,
-            self._grips.rows(rows),
-            self._config.physics,
-            self._geometry,
-            self._trial.stand,
-        )
+        return self._engine.world(self._met, self._grips.rows(rows))
 
     # --- what is seen --------------------------------------------------------------------------
 

@@ -234,6 +234,17 @@ class Closing:
         return cls(speed=min(hand.closing_speed, cls().speed))
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Meeting:
+    """What meets in every pair of a world."""
+
+    body: SlipBody
+    physics: SlipPhysics
+    geometry: Hand
+    stand: Stand | None = None
+    """What the objects stand on while the fingers close; None = they are free."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Grips:
     """Where K hands are on K copies of the object."""
@@ -358,15 +369,8 @@ class Engine(ABC):
         return version(self.name)
 
     @abstractmethod
-    def world(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        stand: Stand | None = None,
-    ) -> HandWorld:
-        """Return a world with these pairs; without a stand the objects close on are free."""
+    def world(self, met: Meeting, grips: Grips) -> HandWorld:
+        """Return a world with these pairs."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +38,7 @@ from realsim.many import Outcome, Shared, Task, Workers, at_most, open_pool, run
 from realsim.records import CameraIntrinsics, GraspSet, View
 from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.profiles import profile
-from realsim.rendering.photo import Photo
+from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.annotation.annotate import annotate
@@ -47,6 +47,9 @@ from realsim_sim_bridge.annotation.summary import AnnotationSummary
 from realsim_sim_bridge.synthetic.claim import claimed_session, with_stored_models
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import SyntheticScene, save_surroundings
+
+if TYPE_CHECKING:
+    from realsim.rendering.photoreal import PhotorealRenderer
 
 PHOTO, DEPTH = 0, 1
 """Streams of chance of a frame: another depth camera leaves the photograph as it is."""
@@ -76,19 +79,6 @@ class SyntheticFrame:
     """Cost of the depth image [s]."""
     notes: tuple[str, ...] = ()
     """What the renderer wants a person to know: that it is slower than it could be, say."""
-
-
-class PictureSource(Protocol):
-    """A renderer of photographs: the embedded or the photoreal one, which also has `notes`."""
-
-    def render(
-        self,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator | None = None,
-    ) -> Photo:
-        """Return the photograph of a view."""
-        ...
 
 
 class FrameRenderer:
@@ -137,7 +127,9 @@ def require_renderer(config: SyntheticConfig) -> None:
         )
 
 
-def picture_source(synthetic: SyntheticScene, config: SyntheticConfig) -> PictureSource:
+def picture_source(
+    synthetic: SyntheticScene, config: SyntheticConfig
+) -> "PhotoRenderer | PhotorealRenderer":
     """Return the renderer that the config names."""
     placed = synthetic.placed()
     if config.renderer == "photoreal":
@@ -146,8 +138,6 @@ def picture_source(synthetic: SyntheticScene, config: SyntheticConfig) -> Pictur
         return PhotorealRenderer(
             placed, synthetic.environment, PhotorealConfig(samples=config.samples)
         )
-    from realsim.rendering.photo import PhotoRenderer
-
     return PhotoRenderer(placed, environment=synthetic.environment)
 
 
@@ -173,11 +163,6 @@ def depth_camera(synthetic: SyntheticScene, config: SyntheticConfig) -> DepthCam
 def frame_of_job(job: FrameJob, index: int, T_world_cam: ArrayLike) -> SyntheticFrame:
     """Return a frame of a job; a worker builds its renderer at the first one."""
     return _renderer_of(job).render(index, T_world_cam)
-
-
-def forget_job() -> None:
-    """Let this process's renderer go; a scene's structures can be hundreds of megabytes."""
-    _renderer_of.cache_clear()
 
 
 @lru_cache(maxsize=1)
@@ -360,7 +345,7 @@ def _write_frames(
         with open_pool(at_most(workers, len(due))) as pool:
             run_many(tasks, pool, keep, in_order=True)
     finally:
-        forget_job()
+        _renderer_of.cache_clear()  # a scene's structures can be hundreds of megabytes
     store.close()
     return _Spent(count, {name: cpu_s / count for name, cpu_s in parts.items()}, notes)
 

@@ -11,7 +11,7 @@ from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.motion import min_jerk
 from realsim_sim_bridge.slip.slip_test import SlipConfig, batches
-from realsim_sim_bridge.slip.world import Engine, Grips, SlipBody
+from realsim_sim_bridge.slip.world import Engine, Grips, Meeting, SlipBody
 from realsim_sim_bridge.validation.specimens import SIDE_M
 
 # --- Coulomb's limit for a rigid object held at points: the load at which it slips ---------------
@@ -171,7 +171,7 @@ def hold(
         Ts_obj_grasp=hand.grasps_of_pads(upright, SIDE_M),
         openings_m=np.full(n, SIDE_M + 0.006),
     )
-    with engine.world(body, grips, config.physics, hand) as world:
+    with engine.world(Meeting(body, config.physics, hand), grips) as world:
         closed = world.close(config.closing)
         start = world.states().Ts_world_body
         steps, ramp = round((ramp_s + hold_s) / world.dt), round(ramp_s / world.dt)

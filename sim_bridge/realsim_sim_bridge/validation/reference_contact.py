@@ -16,23 +16,20 @@ from typing import Any
 import numpy as np
 
 from realsim import __version__
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
     Grips,
     HandWorld,
-    Mask,
+    Meeting,
     Motion,
     PadModel,
     PairStates,
     Replay,
-    SlipBody,
-    SlipPhysics,
 )
 from realsim_sim_bridge.validation import reference_loops as loops
 
@@ -76,26 +73,19 @@ class ReferenceEngine(Engine):
         """Return realsim's version, whose part it is."""
         return __version__
 
-    def world(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        stand: Stand | None = None,
-    ) -> "ReferenceWorld":
+    def world(self, met: Meeting, grips: Grips) -> "ReferenceWorld":
         """Return a world with these pairs.
 
         Raises:
             InputError: the objects stand on something, the hand has no sphere pads, or a part of
                 the object is flat.
         """
-        if stand is not None:
+        if met.stand is not None:
             raise InputError(
                 "the reference contact model closes on free objects and was given a table; give "
                 "it trials without a stand."
             )
-        return ReferenceWorld(body, grips, physics, geometry, self.settings)
+        return ReferenceWorld(met, grips, self.settings)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -155,15 +145,9 @@ def _points(triangles: list[Array], planes: list[Array]) -> Array:
 class ReferenceWorld(HandWorld):
     """K pairs, each a row of state (`reference_loops`) in its hand's axes."""
 
-    def __init__(
-        self,
-        body: SlipBody,
-        grips: Grips,
-        physics: SlipPhysics,
-        geometry: Hand,
-        settings: ReferenceSettings,
-    ) -> None:
+    def __init__(self, met: Meeting, grips: Grips, settings: ReferenceSettings) -> None:
         """Place the hands open and the objects where the grips say; see `ReferenceEngine.world`."""
+        body, physics, geometry = met.body, met.physics, met.geometry
         pads = physics.pads
         if pads is None:
             raise InputError(

@@ -190,7 +190,7 @@ def press_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     faces_m = np.zeros(2)
     for i, force_n in enumerate(forces.tolist()):
         slip = with_hand(config.slip, force_n, config.slip.physics.friction)
-        with engine.world(trial.body, grips, slip.physics, config.hand) as world:
+        with engine.world(trial.met(slip.physics, config.hand), grips) as world:
             world.close(slip.closing)
             still = max(1, round(config.limits.hold_s / world.dt))
             world.play(np.zeros((1, still, 6)), still, LOST_M)

@@ -249,7 +249,8 @@ def _asked(
 def _found(engine: Engine, slip: SlipConfig, mass_kg: float, hand: Hand) -> dict[str, float]:
     """Return what the engine says of a closed world, with the friction that its rule makes."""
     trial = cube_trial(mass_kg, DOWN[None], hand)
-    with engine.world(trial.body, trial.grips(slip.headroom_m), slip.physics, hand) as world:
+    grips = trial.grips(slip.headroom_m)
+    with engine.world(trial.met(slip.physics, hand), grips) as world:
         world.close(slip.closing)
         found: dict[str, Any] = world.settings()
     pair = found["finger_friction"], found["object_friction"]
