@@ -14,7 +14,7 @@ from realsim.geometry import se3
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.candidates import Candidate, Sought
 from realsim.registration.search.height_grid import HeightGrid
-from realsim.registration.search.polish import NOBODY, owners
+from realsim.registration.search.polish import owners
 from realsim.registration.search.scoring import Score
 
 SURE_AGREE = 0.965
@@ -69,7 +69,7 @@ def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained:
 def explained_points(cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]]) -> Mask:
     """Return which points (N,) lie on one of these objects."""
     Ts = [c.T_world_obj for _, c in placed]
-    return owners(cloud, [s for s, _ in placed], Ts, EXPLAINED_M) != NOBODY
+    return owners(cloud, [s for s, _ in placed], Ts, EXPLAINED_M) >= 0
 
 
 def is_sure(score: Score | None) -> bool:

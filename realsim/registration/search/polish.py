@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Int64
-from realsim.compiled import njit
-from realsim.geometry.distance_field import sample
-from realsim.geometry.point_loops import move_back
+from realsim.arrays import Array, Array32, Int32
 from realsim.registration.evidence import Cloud
+from realsim.registration.judging import ownership
 from realsim.registration.search.candidates import (
     FINE,
     FINE_POINTS,
@@ -38,10 +36,6 @@ from realsim.registration.search.scoring import (
 )
 from realsim.registration.solver import Stage
 
-NOBODY = -1
-"""Owner of a point that is near to no object."""
-
-
 REACH_M = 0.005
 """A point further than this from every surface belongs to nobody [m]."""
 ROUNDS = 2
@@ -52,7 +46,7 @@ KEPT_GAIN = 0.97
 """Share of the rendered gain that must remain."""
 
 
-def owners(cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m: float) -> Int64:
+def owners(cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m: float) -> Int32:
     """Return for every point (N,) the place of the object whose surface is nearest; -1 = none.
 
     Args:
@@ -61,39 +55,8 @@ def owners(cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m
         Ts: their poses (4, 4).
         reach_m: greatest distance [m].
     """
-    nearest = np.full(len(cloud.points), reach_m)
-    owner = np.full(len(cloud.points), NOBODY, dtype=np.int64)
-    for n, (sought, T) in enumerate(zip(soughts, Ts, strict=True)):
-        field = sought.body.field
-        _claim(
-            cloud.points, T, sought.body.center(T), sought.reach_m + reach_m,
-            (field.grid, field.origin, field.cell), (nearest, owner), n,
-        )  # fmt: skip
-    return owner
-
-
-@njit
-def _claim(
-    points: Array,
-    T: Array,
-    center: Array,
-    radius: float,
-    lattice: tuple[Array32, Array, float],
-    state: tuple[Array, Int64],
-    number: int,
-) -> None:
-    """Give an object the points that are nearer to it than to those before it."""
-    grid, origin, cell = lattice
-    nearest, owner = state
-    for m in range(len(points)):
-        a, b, c = points[m, 0] - center[0], points[m, 1] - center[1], points[m, 2] - center[2]
-        if a * a + b * b + c * c > radius * radius:
-            continue
-        x, y, z = move_back(T, points[m, 0], points[m, 1], points[m, 2])
-        d = abs(sample(grid, origin, cell, x, y, z)[0])
-        if d < nearest[m]:
-            nearest[m] = d
-            owner[m] = number
+    claims = ownership.make_claims([s.body for s in soughts], Ts, None, reach_m)
+    return ownership.owners(claims, cloud.points)
 
 
 def polish_poses(
