@@ -48,7 +48,6 @@ class NearTask:
 
     intake: Intake
     plane: SupportPlane | None
-    no_plane: str
     evidence: Evidence
     config: RegistrationConfig
 
@@ -68,7 +67,6 @@ class FewViews:
     found: list[near_start.BestStart]
     history: list[dict[str, Any]]
     plane: SupportPlane | None
-    no_plane: str
     stride: int
 
 
@@ -81,8 +79,8 @@ def begin(
     cameras = intake.cameras[:, :3, 3]
     distance = float(np.median(np.linalg.norm(cameras - centers.mean(0), axis=1)))
     sigma = float(evidence.noise.sigma(np.array([distance]))[0])
-    plane, why = find_support_plane(evidence.support, centers, cameras, config.plane, sigma, up)
-    return NearTask(intake, plane, why, evidence, config)
+    plane, _ = find_support_plane(evidence.support, centers, cameras, config.plane, sigma, up)
+    return NearTask(intake, plane, evidence, config)
 
 
 def search_near(
@@ -116,7 +114,7 @@ def register_few(
     kept, clouds, history = _joint(work, bodies, found)
     return FewViews(
         kept=kept, clouds=clouds, found=found, history=history, plane=work.plane,
-        no_plane=work.no_plane, stride=work.evidence.stride,
+        stride=work.evidence.stride,
     )  # fmt: skip
 
 

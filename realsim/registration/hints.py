@@ -50,12 +50,6 @@ from realsim.registration.views import SampleConfig, sample_views
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import read_object
 
-__all__ = [
-    "Box", "Click", "Hint", "HintScene", "Marked", "RoughPose", "Where",
-    "parse_object", "parse_objects", "read_hints", "read_starts", "region_of",
-    "wanted_objects",
-]  # fmt: skip
-
 MOST_INSTANCES = 100
 """Instances of one object that can be asked for at once."""
 KINDS = ("T_world_obj", "click", "box", "mask")

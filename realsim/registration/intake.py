@@ -176,16 +176,16 @@ def check_odometry(
             f"odometry was not tried: the views lie {apart:.0f} degrees from their neighbours in "
             f"the median; at most {config.odometry_deg:.0f} are accepted. Capture more views."
         )
-        return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)
-    fine = sampling(intake.intrinsics, 1, config)
-    views = intake.views
-    if views[0].area_px > fine.stride**2:
-        views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
-    try:
-        return check_kinematics(views, intake.plane), None
-    except InputError as error:
-        words = f"odometry was not tried: {error}"
-        return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)
+    else:
+        fine = sampling(intake.intrinsics, 1, config)
+        views = intake.views
+        if views[0].area_px > fine.stride**2:
+            views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
+        try:
+            return check_kinematics(views, intake.plane), None
+        except InputError as error:
+            words = f"odometry was not tried: {error}"
+    return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)
 
 
 def neighbours_apart_deg(intake: Intake) -> float:

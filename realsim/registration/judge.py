@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,12 +22,14 @@ from realsim.registration.judging.surface_residuals import (
     surface_residuals,
 )
 from realsim.registration.judging.verdict import REJECT, probability_right, verdict_of
+from realsim.registration.odometry.cross_check import Fault
 from realsim.registration.refinement.flat import is_flat
 from realsim.registration.refinement.refine import area_at
 from realsim.registration.rivals_around import Around
 from realsim.registration.search.flat_search import FLAT_HEIGHT_M, cover, explained_at, table_map
 from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import Checked, verify_objects
+from realsim.registration.view_agreement import ViewFinding
 
 ONE_VIEW_CHECKS = ("residual_bound_mm",)
 """What the surface residuals of a single view are good for."""
@@ -40,18 +41,8 @@ WORST = ("accepted", "doubtful", "rejected")
 """Verdicts, better first."""
 
 
-class Defect(Protocol):
-    """Something that is wrong with a view, or with the scene as a whole."""
-
-    @property
-    def kind(self) -> str:
-        """What it is, in a word or two."""
-        ...
-
-    @property
-    def words(self) -> str:
-        """One or two sentences for a person."""
-        ...
+Defect = ViewFinding | SceneFinding | Fault
+"""Something that is wrong with a view, or with the scene as a whole."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -97,9 +88,8 @@ def judge_objects(
     if given.around:
         # Of few views half of the right poses look improbable to checks that were set on many;
         # they warn below `reject`, and what the views leave open decides.
-        least = REJECT
         probabilities = [
-            a.probability * min(1.0, p / least)
+            a.probability * min(1.0, p / REJECT)
             for a, p in zip(given.around, probabilities, strict=True)
         ]
     # A single view leaves probabilities low; what the bounds do not reject still moved alike.
@@ -215,16 +205,9 @@ def _object(
         reasons = (*reasons, *(f.words for f in mine))
         if verdict == "accepted":
             verdict = "doubtful"
-    checks: dict[str, float] = {
-        name: float(value) for name, value in features.items() if value is not None
-    }
-    checks |= {"probability": probability, "blind_axes": float(given.blind[k])}
+    known = {**features, "probability": probability, "blind_axes": given.blind[k]}
+    checks = {n: float(v) for n, v in known.items() if v is not None and np.isfinite(v)}
     return ObjectPose(
         obj_id=body.start.obj_id, instance=body.start.instance, T_world_obj=given.poses[k],
-        covariance=given.covariances[k], checks=_finite(checks), verdict=verdict, reasons=reasons,
+        covariance=given.covariances[k], checks=checks, verdict=verdict, reasons=reasons,
     )  # fmt: skip
-
-
-def _finite(checks: Mapping[str, float]) -> dict[str, Any]:
-    """Return the checks that have a value."""
-    return {name: value for name, value in checks.items() if np.isfinite(value)}

@@ -226,9 +226,8 @@ def _weak_directions(body: Body, fit: PoseFit) -> Array:
     length = OFFSETS_M[-1]
     for v in vectors.T:
         T = moved_about_center(body, np.eye(4), length * v)
-        low, high = body.bounds_obj
-        moved = float(np.linalg.norm(se3.transform(T, np.stack([low, high])) - [low, high],
-                                     axis=1).max())  # fmt: skip
+        apart = se3.transform(T, body.bounds_obj) - body.bounds_obj
+        moved = float(np.linalg.norm(apart, axis=1).max())
         if mssd_symmetric(np.eye(4), T, body.model) > DECLARED_SHARE * moved:
             chosen.append(v)
         if len(chosen) == 2:
@@ -253,12 +252,6 @@ def _laid_down(body: Body, Ts: Array, images: Images) -> Array:
     return T @ laid_down(body, se3.invert(T) @ Ts, FLAT_M)
 
 
-def _motion(body: Body, T_from: Array, T_to: Array) -> Array:
-    """Return the motion (6,) of the box's centre between two poses, turns times the radius [m]."""
-    c = se3.from_translation(body.center_obj)
-    return se3.log(se3.invert(T_from @ c) @ T_to @ c) * np.repeat([body.radius_m, 1.0], 3)
-
-
 def _follows(body: Body, T_world_obj: Array, T_world_cam: Array) -> Array:
     """Return how the object (3,) follows the offset of inverse depth, in its own axes [m^2]."""
     T = se3.invert(T_world_cam) @ T_world_obj
@@ -267,8 +260,13 @@ def _follows(body: Body, T_world_obj: Array, T_world_cam: Array) -> Array:
 
 
 def _twist(body: Body, T_best: Array, T: Array) -> Array:
-    """Return the motion (6,) from the best pose to another, turned by symmetry to be the least."""
-    return _motion(body, T_best, aligned_pose(T_best, T, body.model))
+    """Return the motion (6,) from the best pose to another, turned by symmetry to be the least.
+
+    It is that of the box's centre, turns times the radius [m].
+    """
+    c = se3.from_translation(body.center_obj)
+    T_to = aligned_pose(T_best, T, body.model)
+    return se3.log(se3.invert(T_best @ c) @ T_to @ c) * np.repeat([body.radius_m, 1.0], 3)
 
 
 def _costs(body: Body, Ts: Array, others: Sequence[tuple[Body, Array]], images: Images) -> Array:
