@@ -7,7 +7,7 @@ Frames keep the numbers that they had in the data set they were imported from.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,9 +21,10 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.imported_labels import ImportedLabels, load_imported
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
-from realsim.records import GraspSet, ObjectModel
+from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.records import bop_units as units
 from realsim.store import SessionStore, load_grasps, load_scene
+from realsim.store.results import grasps_on
 from realsim.store.session_store import depth_path, rgb_path
 from realsim.store.trajectories import load_trajectories
 
@@ -43,7 +44,7 @@ class SessionScene:
 
     def __init__(
         self,
-        store: SessionStore,
+        session: tuple[SessionStore, Scene | None],
         *,
         number: int,
         split: str,
@@ -54,7 +55,7 @@ class SessionScene:
         seen_by: tuple[str, SessionStore],
     ) -> None:
         """Take over a session; see `open_session_scene`."""
-        self.store = store
+        self.store, self._scene = session
         self._camera, self._images = seen_by
         self._imported, self._views = imported, dict(views)
         self.number = number
@@ -79,10 +80,8 @@ class SessionScene:
     @property
     def T_world_table(self) -> Array | None:
         """(4, 4) supporting plane in world, z up [m]; None = not known."""
-        if self.store.has("registration/scene.json"):
-            plane = load_scene(self.store).plane
-            if plane is not None:
-                return plane.T_world_table
+        if self._scene is not None and self._scene.plane is not None:
+            return self._scene.plane.T_world_table
         return None if self._imported is None else self._imported.T_world_table
 
     @property
@@ -178,11 +177,11 @@ class SessionScene:
         return self._models
 
     def grasps(self) -> SceneGrasps | None:
-        """Return the grasps that were tried by physics; None = there are none."""
-        sets: list[GraspSet] = load_grasps(self.store)
-        if not sets or not self.store.has("registration/scene.json"):
+        """Return the grasps that were tried by physics on objects that are there; None = none."""
+        scene = self._scene
+        sets = [] if scene is None else grasps_on(scene, load_grasps(self.store))
+        if scene is None or not sets:
             return None
-        scene = load_scene(self.store)
         wanted = {s.instance for s in sets}
         attempts = {s.instance: load_trajectories(self.store, s) for s in sets}
         return SceneGrasps(
@@ -195,17 +194,14 @@ class SessionScene:
         )
 
 
-def _moved_since_tried(store: SessionStore) -> list[float]:
+def _moved_since_tried(scene: Scene, sets: Sequence[GraspSet]) -> list[float]:
     """Return how far objects have been moved on the table since their grasps were tried [m]."""
-    if not store.has("registration/scene.json"):
-        return []
-    scene = load_scene(store)
     if scene.plane is None:
         return []
     T_table_world = se3.invert(scene.plane.T_world_table)
     stands = {o.instance: T_table_world @ o.T_world_obj for o in scene.objects}
     moved: list[float] = []
-    for tried in load_grasps(store):
+    for tried in grasps_on(scene, sets):
         then = np.array((tried.parameters.get("inputs") or {}).get("T_table_obj", np.nan))
         now = stands.get(tried.instance)
         if now is not None and then.shape == (4, 4):
@@ -217,6 +213,7 @@ def _moved_since_tried(store: SessionStore) -> list[float]:
 
 def open_session_scene(
     store: SessionStore,
+    scene: Scene | None = None,
     *,
     labels: Labels = "auto",
     split: str = "",
@@ -227,6 +224,7 @@ def open_session_scene(
 
     Args:
         store: the session.
+        scene: its objects as reviewers left them; None = as they were registered, if they were.
         labels: 'annotated' = what `realsim annotate` wrote; 'imported' = what the data set said
             that the session was imported from; 'auto' = the former where it is there, else the
             latter; 'none' = images and cameras only.
@@ -266,16 +264,23 @@ def open_session_scene(
         notes += imported.notes
     if chosen == "none" and labels != "none":
         notes.append("it has no labels: images and cameras only.")
-    moved = _moved_since_tried(store)
-    if moved:
+    if scene is None and store.has("registration/scene.json"):
+        scene = load_scene(store)
+    sets = [] if scene is None else load_grasps(store)
+    again = f"run `realsim school {store.folder.name} --restart` and annotate again."
+    if scene is not None and (moved := _moved_since_tried(scene, sets)):
         notes.append(
             f"the grasps of {len(moved)} object{'s' if len(moved) > 1 else ''} were tried where "
-            f"they no longer stand (moved by up to {1e3 * max(moved):.1f} mm): run `realsim school "
-            f"{store.folder.name} --restart` and annotate again."
+            f"they no longer stand (moved by up to {1e3 * max(moved):.1f} mm): {again}"
+        )
+    if scene is not None and (gone := len(sets) - len(grasps_on(scene, sets))):
+        notes.append(
+            f"the grasps of {gone} object{'s' if gone > 1 else ''} stay out: they were tried on an "
+            f"object that is another now, or no more there: {again}"
         )
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
-        store,
+        (store, scene),
         number=_number(store, imported),
         split=split or (imported.split if imported is not None else _split_of(store)),
         imported=imported if chosen != "none" else None,

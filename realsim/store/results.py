@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,15 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
         InputError: a file is broken, or of a newer format.
     """
     return [_load_grasp_set(file) for file in sorted(grasp_folder(folder).glob("*_obj*.npz"))]
+
+
+def grasps_on(scene: Scene, sets: Iterable[GraspSet]) -> list[GraspSet]:
+    """Return the sets of those objects that the scene has under the same instance.
+
+    A registration may number the objects anew: an instance is then another object.
+    """
+    there = {o.instance: o.obj_id for o in scene.objects}
+    return [s for s in sets if there.get(s.instance) == s.obj_id]
 
 
 def _load_grasp_set(file: Path) -> GraspSet:

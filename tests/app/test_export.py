@@ -23,9 +23,12 @@ from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.formats.graspnet.annotations import read_objects
 from realsim.formats.graspnet.grasp_group import read_grasp_group
 from realsim.formats.session_scene import open_session_scene
+from realsim.geometry import se3
 from realsim.geometry.metrics import mask_iou
+from realsim.review import journal
 from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
 from school_sessions import registered, scene
+from shared_sessions import copy_of
 from synthetic_scenes import captured_session
 from tried_grasps import tried_set
 from typed_commands import finished, refused
@@ -426,6 +429,26 @@ def test_grasps_of_a_frame_are_in_its_camera(tried, tmp_path):
         assert len(group) == len(want) > 10
         np.testing.assert_allclose(group.Ts_a_grasp, [T for T, _ in want], atol=2e-6)
         np.testing.assert_allclose(group.scores, [label for _, label in want], atol=1e-6)
+
+
+def test_grasps_of_what_is_another_object_stay_out_and_moves_are_told(tried, tmp_path):
+    store = SessionStore.open(copy_of(tried, tmp_path / "s"))
+    scene = load_scene(store)
+    first, *others = scene.objects
+    anew = replace(scene, objects=(replace(first, obj_id=first.obj_id + 90), *others))
+    seen, grasps = open_session_scene(store, anew), open_session_scene(store, anew).grasps()
+    assert first.instance not in {s.instance for s in grasps.sets} and len(grasps.sets) > 0
+    assert any("of 1 object stay out" in note for note in seen.notes)
+    (tried_there,) = (s for s in load_grasps(store) if s.instance == first.instance)
+    there = {"T_table_obj": (se3.invert(scene.plane.T_world_table) @ first.T_world_obj).tolist()}
+    save_grasps(store, replace(tried_there, parameters={"inputs": there}))
+    said = finished("export", store.folder, "--to", "isaac", "--out", tmp_path / "a").output
+    assert "no longer stand" not in said
+    moved = first.T_world_obj @ se3.from_translation([0.06, 0, 0])
+    entry = journal.new_entry("move", first, "ada", pose=moved)
+    journal.append(store.path(journal.JOURNAL_FILE), entry)
+    said = finished("export", store.folder, "--to", "isaac", "--out", tmp_path / "b").output
+    assert "no longer stand (moved by up to 60.0 mm)" in said and "1 unchecked" in said
 
 
 def test_grasps_are_of_sessions(tried, tmp_path):

@@ -17,7 +17,7 @@ from realsim.app.importing.source import ImportRequest, kinds_of, open_source, r
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.robots.arm import find_arm
-from realsim.store import SessionStore
+from realsim.store import SessionStore, atomic
 from refusals import refused
 from sources_in_memory import CAMERA, Recording, frame_of, ten
 from typed_commands import realsim
@@ -71,6 +71,11 @@ def test_another_source_is_refused_until_it_is_said(tmp_path):
     import_session(Recording(ten()[:4], content="b"), folder, QUIET, overwrite=True)
     check_equal(folder, ten()[:4])
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
+    atomic.write_text(folder / "review/journal.jsonl", "what people decided\n")
+    import_session(others[0], folder, QUIET, overwrite=True)
+    check_equal(folder, ten())
+    check_equal(tmp_path / "s.before", ten()[:4])
+    assert (tmp_path / "s.before/review/journal.jsonl").is_file()
 
 
 def test_nobodys_folder_and_no_captured_session_is_touched(tmp_path):

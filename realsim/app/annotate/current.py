@@ -12,6 +12,7 @@ from realsim.many import Workers
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore, provenance
 from realsim.store.cameras import open_cameras
+from realsim.store.results import grasps_on
 from realsim.untrusted.own_json import to_json
 
 if TYPE_CHECKING:
@@ -190,9 +191,8 @@ def grasps_of_scene(
     store: SessionStore, scene: Scene, sets: list[GraspSet], console: Console
 ) -> list[GraspSet]:
     """Return the grasps of objects that are still in the scene; of others it is told."""
-    there = {o.instance: o.obj_id for o in scene.objects}
-    kept = [g for g in sets if there.get(g.instance) == g.obj_id]
-    gone = [str(g.instance) for g in sets if there.get(g.instance) != g.obj_id]
+    kept = grasps_on(scene, sets)
+    gone = [str(g.instance) for g in sets if g not in kept]
     if gone:
         console.warn(
             f"grasps of instance {', '.join(gone)} are left out: they were tried on an object that "

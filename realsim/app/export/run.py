@@ -96,9 +96,9 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
                 given = _as_asked(_numbered(opened, ids), target, request, out)
                 all_ids.append(ids)
                 written = _write(given, place, target, folder, request, console)
-                facts.append(_with_notes(
-                    _facts(source, opened, written, target), _bare_words(without, target)
-                ))  # fmt: skip
+                known = _facts(source, opened, written, target)
+                told = [*_bare_words(without, target), *_unsure_words(known, target)]
+                facts.append(_with_notes(known, told))
         except InputError:
             folder.abandon()
             raise
@@ -156,6 +156,13 @@ def _bare_words(without: Mapping[int, int], target: Target) -> list[str]:
         return []
     here = ", ".join(f"{i} (here {k})" for i, k in without.items())
     return [f"there is no mesh of object {here}: it is exported without a model."]
+
+
+def _unsure_words(facts: SceneFacts, target: Target) -> list[str]:
+    unsure = [f"{n} {v}" for v, n in sorted(facts.trust.verdicts.items()) if v != "accepted"]
+    if not unsure or target.kind == "cameras" or facts.labels == LABELS["imported"]:
+        return []
+    return [f"not accepted by checks or reviewers: objects that are {', '.join(unsure)}."]
 
 
 def _with_notes(facts: SceneFacts, told: Sequence[str]) -> SceneFacts:

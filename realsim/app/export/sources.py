@@ -117,14 +117,19 @@ def _is_inner(folder: Path) -> bool:
 def _sessions(
     source: Path, folders: list[Path], request: ExportRequest, all_cameras: bool
 ) -> list[SourceScene]:
-    from realsim.app.stages import open_session
+    from realsim.app.stages import judged_scene, open_session
     from realsim.formats.session_scene import open_session_scene
 
     def opener(folder: Path, camera: str, further: Path | None) -> Callable[[], LabelledScene]:
-        return lambda: open_session_scene(
-            open_session(folder), labels=request.labels, split=request.split, camera=camera,
-            seen_by=None if further is None else SessionStore.open(further),
-        )  # fmt: skip
+        def opened() -> LabelledScene:
+            store = open_session(folder)
+            scene = judged_scene(store) if store.has("registration/scene.json") else None
+            return open_session_scene(
+                store, scene, labels=request.labels, split=request.split, camera=camera,
+                seen_by=None if further is None else SessionStore.open(further),
+            )  # fmt: skip
+
+        return opened
 
     scenes: list[SourceScene] = []
     for folder in folders:

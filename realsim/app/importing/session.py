@@ -5,6 +5,7 @@ its content and the pixels of the last frame prove; another source is refused.
 """
 
 import hashlib
+import itertools
 import json
 import shutil
 import time
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
     from realsim.formats.labelled_scene import LabelledScene
 
+IMPORTED = ("rgb", "depth", "models", "imported")
+"""Folders of a session that hold nothing but what an import writes."""
 KEY = "import"
 """Entry of the session's extra under which the source is described."""
 KEY_IN_SOURCE = "content_key"
@@ -104,7 +107,11 @@ def import_session(
         raise InputError(f"{source.name} has no frames. {' '.join(source.notes)}")
     key = content_key(source)
     folder = Path(folder)
-    with _place_for(folder, source, key, overwrite=overwrite, whole=whole) as place:
+    aside = folder.with_name(f".{folder.name}.replaced")
+    if aside.is_dir():  # a kill came between the renames
+        _put_away(aside, folder, console) if folder.exists() else aside.rename(folder)
+    is_replaced = _is_replaced(folder, source, key, overwrite=overwrite)
+    with _place_for(folder, console, is_replaced=is_replaced, whole=whole) as place:
         console.warn(*source.notes)
         store = _opened(place, source, key)
         try:
@@ -151,17 +158,16 @@ def content_key(source: FrameSource) -> str:
 
 @contextmanager
 def _place_for(
-    folder: Path, source: FrameSource, key: str, *, overwrite: bool, whole: bool
+    folder: Path, console: Console, *, is_replaced: bool, whole: bool
 ) -> "Generator[Path]":
     """Yield where to write: the session's folder, or one beside it that then takes its place.
 
+    An earlier session that holds a file which the new one has not is kept beside it.
+
     Raises:
-        InputError: the folder may not hold this import, or the import was refused; says what stays.
+        InputError: the import was refused; says what stays.
     """
     aside = folder.with_name(f".{folder.name}.replaced")
-    if aside.is_dir() and not folder.exists():  # a kill came between the two renames
-        aside.rename(folder)
-    is_replaced = _is_replaced(folder, source, key, overwrite=overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     place = folder.with_name(f".{folder.name}.new") if is_replaced else folder
     is_new = not (place / SESSION_FILE).is_file()
@@ -172,10 +178,9 @@ def _place_for(
                 place.mkdir()
             yield place
             if is_replaced:
-                shutil.rmtree(aside, ignore_errors=True)
                 folder.rename(aside)
                 place.rename(folder)
-                shutil.rmtree(aside)
+                _put_away(aside, folder, console)
         except InputError as error:
             stays = f"The frames that are there stay in {folder}."
             if is_replaced:
@@ -187,6 +192,22 @@ def _place_for(
         finally:
             if is_replaced:
                 shutil.rmtree(place, ignore_errors=True)
+
+
+def _put_away(aside: Path, folder: Path, console: Console) -> None:
+    """Take an earlier session away, or keep it where it holds what no import writes."""
+    names = (f"{folder.name}.before{k if k > 1 else ''}" for k in itertools.count(1))
+    kept = next(path for name in names if not (path := folder.with_name(name)).exists())
+    old, new = ({p.relative_to(f) for p in f.rglob("*") if p.is_file()} for f in (aside, folder))
+    lost = sorted(p.as_posix() for p in old - new if p.parts[0] not in IMPORTED)
+    if not lost:
+        shutil.rmtree(aside)
+        return
+    aside.rename(kept)
+    console.warn(
+        f"the session that was in {folder} is kept as {kept}: it holds {len(lost)} files that the "
+        f"new one has not ({shown(lost)})."
+    )
 
 
 def _is_replaced(folder: Path, source: FrameSource, key: str, *, overwrite: bool) -> bool:

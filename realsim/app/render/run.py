@@ -205,6 +205,7 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     """
     from threadpoolctl import threadpool_limits
 
+    from realsim.app.annotate.current import grasps_of_scene
     from realsim.app.stages import judged_scene, note, open_session, require_sound, session_models
     from realsim.rendering.overlay import save_png
     from realsim.store import load_grasps, provenance
@@ -214,7 +215,7 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     require_sound(store)
     models = session_models(store)
     require_shown(store, scene, models)
-    grasps = load_grasps(store.folder / "grasps")
+    grasps = grasps_of_scene(store, scene, load_grasps(store), console)
     folder = request.folder(store.folder)
     _refuse_folder(folder, store.folder)
     with threadpool_limits(limits=1):

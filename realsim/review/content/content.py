@@ -32,6 +32,7 @@ from realsim.review.content.meshes import DisplayMesh, display_mesh
 from realsim.review.content.views import FirstLook, Region, first_look, region_of
 from realsim.store import SessionStore, atomic, load_grasps, load_scene
 from realsim.store.manifest import Manifest
+from realsim.store.results import grasps_on
 from realsim.store.session_store import rgb_path
 
 FOLDER = "review/thumbnails"
@@ -238,14 +239,13 @@ class SceneContent:
             damaged=damaged, on_photograph=take,
         )  # fmt: skip
         give_back_memory()
-        instances = {o.instance for o in scene.objects}
         return SceneContent(
             store=store, scene=scene, models=models, meshes=DisplayMeshes(models, config),
             views=views, shown_views=shown, intrinsics=store.session.intrinsics, region=region,
             look=first_look(region, views, up), cloud=cloud,
             thumbnails=thumbnails.of([v.index for v in shown], damaged, progress),
             damaged=damaged,
-            grasp_sets=tuple(g for g in load_grasps(store) if g.instance in instances),
+            grasp_sets=tuple(grasps_on(scene, load_grasps(store))),
         )  # fmt: skip
 
     def pose_of(self, view: int) -> Array:
