@@ -147,7 +147,7 @@ def tried_body(
             moved = f" by {1e3 * float(np.linalg.norm((then - T_table_obj)[:3, 3])):.1f} mm"
         raise InputError(
             f"{named} does not stand where its grasps were tried: it has been moved{moved} since. "
-            "Run `realsim school` again on the scene as it is."
+            "Run `realsim school --restart` on the scene as it is."
         )
     mesh = Mesh(vertices=model.mesh.vertices, faces=model.mesh.faces)
     density = float(stored.get("density", model.density))

@@ -6,6 +6,7 @@ and new grasps side by side look alike and mean different things.
 """
 
 import json
+import re
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -29,6 +30,7 @@ RESULTS_VERSION = 4
 """Raised whenever the same inputs give other results with the same versions of all packages."""
 PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
 """Besides the engines: what the grasps and trajectories come from."""
+OBJECT_FIELD = r"objects\.instance_(\d+)\."
 MOST_TOLD = 8
 """Changed fields that a refusal names; another engine changes them all."""
 
@@ -128,6 +130,11 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
         told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed[:MOST_TOLD])
         if len(changed) > MOST_TOLD:
             told += f"\n  and {len(changed) - MOST_TOLD} more"
+        numbers = {m[1] for field, *_ in changed if (m := re.match(OBJECT_FIELD, field))}
+        moved = ""
+        if numbers:
+            which = ", ".join(str(int(n)) for n in sorted(numbers))
+            moved = f" Objects were moved or exchanged since (instance {which})."
         raise InputError(
-            f"{folder} holds a run that was started with something else:{told}\n{remedy}"
+            f"{folder} holds a run that was started with something else.{moved}{told}\n{remedy}"
         )
