@@ -24,6 +24,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +56,7 @@ from realsim.models.symmetry_surface import (
     texture_breaks,
 )
 from realsim.records import Mesh, ObjectModel
-from realsim.store.arrays_on_disk import read_arrays, write_arrays
+from realsim.store.arrays_on_disk import rebuilt, write_arrays
 
 __all__ = ["SymmetryConfig", "find_symmetries", "with_found_symmetries"]
 
@@ -196,7 +197,7 @@ def _exact_symmetries(mesh: Mesh, folder: Path | None) -> Symmetries:
         digest.update(b"-" if part is None else part.tobytes())
     key = digest.hexdigest()
     path = None if folder is None else folder / f"symmetries_{key}.npz"
-    known = _memory.get(key) or (None if path is None else _loaded(path))
+    known = _memory.get(key) or (None if path is None else rebuilt(path, _of_file))
     if known is None:
         known = find_symmetries(mesh, config, with_mirror=False)
         if path is not None:
@@ -209,19 +210,13 @@ def _exact_symmetries(mesh: Mesh, folder: Path | None) -> Symmetries:
     return known
 
 
-def _loaded(path: Path) -> Symmetries | None:
-    """Return the symmetries of a file, or None if there is none or it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        arrays, notes = read_arrays(path)
-        axes = tuple((tuple(a), tuple(p)) for a, p in arrays["axes"].tolist())
-        return Symmetries(
-            discrete=arrays["discrete"], axes=axes, worst_m=notes["worst_m"],
-            near=tuple(notes["near"]), texture_breaks=notes["breaks"],
-        )  # fmt: skip
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
+def _of_file(arrays: dict[str, Array], notes: dict[str, Any]) -> Symmetries:
+    """Return the symmetries of a file."""
+    return Symmetries(
+        discrete=arrays["discrete"],
+        axes=tuple((tuple(a), tuple(p)) for a, p in arrays["axes"].tolist()),
+        worst_m=notes["worst_m"], near=tuple(notes["near"]), texture_breaks=notes["breaks"],
+    )  # fmt: skip
 
 
 def _fitted(

@@ -1,8 +1,9 @@
 """Arrays and their JSON notes in one npz file, written whole or not at all."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from realsim.errors import InputError
 from realsim.store import atomic
 from realsim.untrusted.arrays import read_npz
 
+Made = TypeVar("Made")
 NOTES = "notes_json"
 """Name of the array that holds the notes as UTF-8 JSON."""
 MOST_BYTES = 8e9
@@ -37,6 +39,18 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     except (InputError, ValueError, KeyError) as error:
         raise InputError(f"{error} Delete {path}: its content is computed again.") from error
     return arrays, notes
+
+
+def rebuilt(
+    path: Path, build: Callable[[dict[str, NDArray[Any]], dict[str, Any]], Made]
+) -> Made | None:
+    """Return what arrays and notes of a file make, or None: no file, damaged, of other content."""
+    if not path.is_file():
+        return None
+    try:
+        return build(*read_arrays(path))
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
 
 
 def is_whole(path: Path) -> bool:

@@ -12,6 +12,7 @@ but not for all of it is kept.
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from realsim.geometry.robust import tukey_weights
 from realsim.interop import import_open3d
 from realsim.records import ObjectModel
 from realsim.registration.search.templates import content_key, is_ball
-from realsim.store.arrays_on_disk import read_arrays, write_arrays
+from realsim.store.arrays_on_disk import rebuilt, write_arrays
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 PARALLEL = 0.998
@@ -147,7 +148,7 @@ def near_symmetries(model: ObjectModel, config: NearSymmetryConfig, folder: Path
         return np.zeros((0, 4, 4))
     key = content_key(model, config)
     path = None if folder is None else folder / f"near_{key}.npz"
-    known = _memory.get(key) if path is None else _load_motions(path)
+    known = _memory.get(key) if path is None else rebuilt(path, _motions)
     if known is None:
         known = _computed(model, config)
         known.setflags(write=False)
@@ -306,11 +307,6 @@ def _exact(model: ObjectModel, points: Array, Ts: Array) -> Array:
     return np.asarray(found, dtype=np.float64).reshape(len(Ts), -1)
 
 
-def _load_motions(path: Path) -> Array | None:
-    """Return the motions of a file, or None if there is none or it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        return np.asarray(read_arrays(path)[0]["transforms"], dtype=np.float64)
-    except (InputError, KeyError):
-        return None
+def _motions(arrays: dict[str, Array], _: dict[str, Any]) -> Array:
+    """Return the motions of a file."""
+    return np.asarray(arrays["transforms"], dtype=np.float64)

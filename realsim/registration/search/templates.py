@@ -9,6 +9,7 @@ import hashlib
 import math
 from dataclasses import astuple, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from realsim.geometry.mesh import hull_vertices, symmetry_transforms
 from realsim.models.resting import Resting, resting_orientations
 from realsim.records import ObjectModel
 from realsim.rendering.rays import PlacedMesh, RayScene
-from realsim.store.arrays_on_disk import read_arrays, write_arrays
+from realsim.store.arrays_on_disk import rebuilt, write_arrays
 
 VERSION = 1
 """Version of the files' content; older files are computed again."""
@@ -109,7 +110,7 @@ def model_templates(
         InputError: the mesh is flat, so it cannot rest.
     """
     path = None if folder is None else folder / f"templates_{content_key(model, config)}.npz"
-    known = None if path is None else _loaded(path)
+    known = None if path is None else rebuilt(path, _of_file)
     if known is None:
         known = _computed(model, config)
         if path is not None:
@@ -257,12 +258,6 @@ def _save(path: Path, t: ModelTemplates) -> None:
     write_arrays(path, arrays, {"is_ball": t.is_ball})
 
 
-def _loaded(path: Path) -> ModelTemplates | None:
-    """Return the templates of a file, or None if there is none or it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        arrays, notes = read_arrays(path)
-        return ModelTemplates(is_ball=bool(notes["is_ball"]), **arrays)
-    except (InputError, TypeError, KeyError):
-        return None
+def _of_file(arrays: dict[str, Any], notes: dict[str, Any]) -> ModelTemplates:
+    """Return the templates of a file."""
+    return ModelTemplates(is_ball=bool(notes["is_ball"]), **arrays)
