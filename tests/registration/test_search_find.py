@@ -324,12 +324,12 @@ def material() -> tuple[Canvas, list[Candidate], list[int]]:
     for p in scene.truth:
         model = scene.models[p.obj_id]
         sought = Sought(body=body_at(model, 24, 50), sameness=make_sameness(model))
-        right.append(candidate(sought, canvas, p.T_world_obj, "right", True))
+        right.append(candidate(sought, canvas, p.T_world_obj, "right"))
         for q in scene.truth:  # everywhere else, turned at random
             shift = q.T_world_obj[:3, 3] - p.T_world_obj[:3, 3]
             turn = se3.from_rt(se3.random_rotation(rng), np.zeros(3))
             T = se3.from_translation(shift + 0.004 * rng.normal(size=3)) @ p.T_world_obj @ turn
-            wrong.append(candidate(sought, canvas, T, "wrong", False))
+            wrong.append(candidate(sought, canvas, T, "wrong"))
     pool = right + wrong
     return canvas, pool, [c.obj_id for c in pool]
 

@@ -313,8 +313,6 @@ class Candidate:
     alone: Score
     """What it gains over the bare table, or over the objects that were sure when it was made."""
     source: str
-    fine: bool = False
-    """Whether it was refined on the fine points."""
 
 
 def fuse(views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane) -> Fused:
@@ -360,22 +358,8 @@ def _near(
     return out[:n].copy()
 
 
-def fit_start(sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool) -> Array:
-    """Return the pose (4, 4) after a coarse or a fine fit to the points near it."""
-    margin = FINE_MARGIN_M if fine else COARSE_MARGIN_M
-    most = FINE_POINTS if fine else COARSE_POINTS
-    points = nearby(cloud, sought, T_world_obj, margin, most)
-    stages = FINE if fine else COARSE
-    return quick_fit(sought.body, points, T_world_obj, stages)
-
-
 def candidate(
-    sought: Sought,
-    canvas: Canvas,
-    T_world_obj: Array,
-    source: str,
-    fine: bool,
-    buffer: Array32 | None = None,
+    sought: Sought, canvas: Canvas, T_world_obj: Array, source: str, buffer: Array32 | None = None
 ) -> Candidate:
     """Return a pose rendered and scored against a buffer; None = the bare table."""
     rendered = render(canvas, sought.body, T_world_obj)
@@ -385,7 +369,6 @@ def candidate(
         rendered=rendered,
         alone=score(canvas, rendered, canvas.table if buffer is None else buffer),
         source=source,
-        fine=fine,
     )
 
 
@@ -405,24 +388,28 @@ def candidates(
         starts: poses (4, 4) and where they come from.
         buffer: what is there already; None = the bare table.
     """
-    Ts = [fit_start(sought, fused.coarse, T, False) for T, _ in starts]
+    Ts: list[Array] = []
+    for T, _ in starts:
+        points = nearby(fused.coarse, sought, T, COARSE_MARGIN_M, COARSE_POINTS)
+        Ts.append(quick_fit(sought.body, points, T, COARSE))
     made = [
-        candidate(sought, canvas, Ts[n], starts[n][1], False, buffer)
+        candidate(sought, canvas, Ts[n], starts[n][1], buffer)
         for n in distinct(sought.sameness, Ts, SAME_M)
     ]
     made.sort(key=lambda c: -c.alone.gain)
-    best = [refine_candidate(sought, fused, canvas, c, buffer) for c in made[:REFINED]]
+    best = [_refined(sought, fused, canvas, c, buffer) for c in made[:REFINED]]
     made = sorted([*best, *made[REFINED:]], key=lambda c: -c.alone.gain)
     kept = distinct(sought.sameness, [c.T_world_obj for c in made], SAME_M)
     return [made[n] for n in kept]
 
 
-def refine_candidate(
-    sought: Sought, fused: Fused, canvas: Canvas, start: Candidate, buffer: Array32 | None = None
+def _refined(
+    sought: Sought, fused: Fused, canvas: Canvas, start: Candidate, buffer: Array32 | None
 ) -> Candidate:
     """Return a candidate refined on the fine points, or as it was if that explains less."""
-    T = fit_start(sought, fused.fine, start.T_world_obj, True)
-    finer = candidate(sought, canvas, T, start.source, True, buffer)
+    points = nearby(fused.fine, sought, start.T_world_obj, FINE_MARGIN_M, FINE_POINTS)
+    T = quick_fit(sought.body, points, start.T_world_obj, FINE)
+    finer = candidate(sought, canvas, T, start.source, buffer)
     return finer if finer.alone.gain >= start.alone.gain else start
 
 

@@ -150,7 +150,7 @@ def _finish(
         evidence = (bench.close, bench.fused.fine, _near(search, at[n], chosen[n]))
         d = decide_rivals(sought, chosen[n].T_world_obj, others, evidence)
         if d.changed:
-            chosen[n] = candidate(sought, bench.canvas, d.T_world_obj, chosen[n].source, True)
+            chosen[n] = candidate(sought, bench.canvas, d.T_world_obj, chosen[n].source)
             renders[n] = render(bench.close, sought.body, d.T_world_obj)
         decisions.append(d)
     bench.watch.lap("contrast")

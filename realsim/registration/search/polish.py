@@ -80,7 +80,7 @@ def polish_poses(
             if len(own) > FINE_POINTS:
                 own = own[np.linspace(0, len(own) - 1, FINE_POINTS).astype(np.int64)]
             T = quick_fit(sought.body, cloud.select(own), now[n].T_world_obj, FINE)
-            new = candidate(sought, canvas, T, now[n].source, True)
+            new = candidate(sought, canvas, T, now[n].source)
             buffer = compose(canvas.table, [c.rendered for k, c in enumerate(now) if k != n])
             before = score(canvas, now[n].rendered, buffer).gain
             if score(canvas, new.rendered, buffer).gain >= KEPT_GAIN * before:
