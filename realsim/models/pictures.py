@@ -147,9 +147,8 @@ def _parts_panel(ax: Any, drawn: Mesh, factor: float, parts: ConvexParts | None)
 
 def _figures_panel(ax: Any, mesh: Mesh, properties: ModelProperties) -> None:
     """Write the figures."""
-    rows = figure_lines(mesh, properties)
+    lines = figure_lines(mesh, properties)
     y, step = 44.0, 17.0
-    lines = [(k, text) for k, text in rows]
     if len(lines) > MOST_LINES:
         lines = [*lines[: MOST_LINES - 1], ("", "... (all of it is in the properties file)")]
     for label, text in lines:

@@ -316,11 +316,9 @@ def residual_checks(residuals: SurfaceResiduals, level_m: float) -> dict[str, fl
     measured, bound = r.measured, wrong_bound_m(level_m)
     through = _looked_through(r)
     watched = r.looks[:, :2].sum(axis=1) > 0
+    unknown = ("wrong_surface", "patch_rms_mm", "patch_rms", "wrong_patch_mm2")
     checks = {
-        "wrong_surface": float("nan"),
-        "patch_rms_mm": float("nan"),
-        "patch_rms": float("nan"),
-        "wrong_patch_mm2": float("nan"),
+        **dict.fromkeys(unknown, float("nan")),
         "looked_through": _share(areas, through & watched, watched),
         "measured_surface": _share(areas, measured, np.ones(len(areas), dtype=np.bool_)),
         "residual_bound_mm": 1e3 * bound,

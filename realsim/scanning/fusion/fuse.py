@@ -234,15 +234,6 @@ def _wrong(
     return wrong
 
 
-__all__ = [
-    "Coverage",
-    "FusedObject",
-    "FusionConfig",
-    "FusionFrame",
-    "ViewCorrection",
-    "fuse_object",
-]
-
 HOPELESS_SHARE = 0.4
 """With less than this of the surface above the cut measured the mesh is rejected."""
 FACING_DOWN = -0.2

@@ -109,8 +109,7 @@ def _one_piece(field: Array32, cell: float) -> tuple[Array32, int, int]:
     keep = solids == 1 + int(np.argmax(sizes))
     labelled = ndimage.label(~keep)
     spaces, holes = labelled
-    open_space = spaces == spaces[0, 0, 0]
-    solid = ~open_space
+    solid = spaces != spaces[0, 0, 0]
     margin = np.float32(0.5 * cell)
     out = np.where(solid & (field >= 0), -margin, field)
     out = np.where(~solid & (field < 0), margin, out)

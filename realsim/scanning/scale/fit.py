@@ -120,16 +120,11 @@ class _Ticks:
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress, self._done, self._total = progress, 0, total
 
-    def step(self) -> None:
-        """One more step is done."""
+    def step(self, *_: int) -> None:
+        """One more step is done, or one more view has been read."""
         self._done += 1
         if self._progress is not None:
             self._progress(min(self._done, self._total), self._total)
-
-    def view(self, done: int, total: int) -> None:
-        """One more view has been read."""
-        del done, total
-        self.step()
 
 
 def _require_views(n: int, what: str) -> None:
@@ -151,9 +146,7 @@ def _evidence(
     noise = measure_noise(frames, config.noise)
     plane = given[0] or find_table(intrinsics, frames, config.table, config.seed)
     footprint = find_object(intrinsics, frames, plane, noise, config.table, given[1])
-    evidence = gather_scan(
-        intrinsics, frames, (plane, footprint), noise, config, ticks.view
-    )  # fmt: skip
+    evidence = gather_scan(intrinsics, frames, (plane, footprint), noise, config, ticks.step)
     _require_views(len(evidence.views), f"left of {len(frames)}: the others do not see the object")
     return evidence
 
@@ -169,9 +162,7 @@ def _joint(
     dropped = tuple(v.index for v, b in zip(evidence.views, bad, strict=True) if b)
     kept = tuple(v for v, b in zip(evidence.views, bad, strict=True) if not b)
     fewer = replace(evidence, views=kept)
-    again = replace(
-        start, views=np.zeros((len(kept), 6)), hand_eye=np.zeros(6)
-    )  # fmt: skip
+    again = replace(start, views=np.zeros((len(kept), 6)), hand_eye=np.zeros(6))
     state, look = joint_fit(shape, fewer, again, config)
     return state, look, fewer, dropped
 

@@ -185,19 +185,19 @@ def outcome(
     seen = np.bincount(geometry.points_of, minlength=len(geometry.points))
     covariances = point_covariances(geometry, robust_sigma(residuals))
     unit = 1e3 if mapped.is_metric else 1.0
-    missing = set(matching.names) - set(geometry.names)
+    own = mapped.covariances
     result = SfmResult(
         poses=poses,
         geometry=geometry,
         is_metric=mapped.is_metric,
-        unregistered=tuple(n for n in matching.names if n in missing),
+        unregistered=tuple(n for n in matching.names if n not in geometry.names),
         models=mapped.models,
         scale=mapped.scale,
         sigma_percent=mapped.sigma_percent,
         alignment=mapped.alignment,
         depth=None,
         reliability=mapped.reliability,
-        camera_covariance=_camera_covariance(mapped, geometry),
+        camera_covariance=None if own is None else np.stack([own[n] for n in geometry.names]),
         point_sigma_mm=unit * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0)),
         track_lengths=seen.astype(np.int64),
         reprojection_px=float(np.nanmedian(lengths)),
@@ -212,12 +212,6 @@ def outcome(
     )
     verdict, reasons = judge(result, job.config)
     return replace(result, verdict=verdict, reasons=reasons)
-
-
-def _camera_covariance(mapped: Mapped, geometry: Geometry) -> Array | None:
-    """Return the cameras' own blocks (V, 6, 6) of the covariance."""
-    own = mapped.covariances
-    return None if own is None else np.stack([own[n] for n in geometry.names])
 
 
 def _notes(
