@@ -9,21 +9,11 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.records.depth_bias import DepthBias
+from realsim.registration import evidence
 from realsim.registration.blind import Kept, blind_motions, keep_start, nearest_to_start
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import (
-    Cloud,
-    DepthFrame,
-    DepthNoise,
-    average_cloud,
-    correct_frame,
-    join_clouds,
-    read_frame,
-    seen_cloud,
-    without_table,
-)
 from realsim.registration.intake import Intake
 from realsim.registration.near_start import ASSIGN_M, assign_points, drop_height, fine_voxel
 from realsim.registration.refinement.config import RefineConfig
@@ -53,13 +43,13 @@ class ManyViews:
     poses: list[Array]
     kept: list[Kept]
     """Fits to the averaged cloud at the final poses, blind turns set back to the start's."""
-    clouds: list[Cloud]
+    clouds: list[evidence.Cloud]
     """Each object's own points, corrected."""
     covariances: list[Array]
     """(6, 6) of each T_world_obj, right perturbation."""
     seen: list[list[SeenPose]]
     """Per object, its pose in every view of the camera in the hand."""
-    frames: tuple[DepthFrame, ...]
+    frames: tuple[evidence.DepthFrame, ...]
     """Frames of the camera in the hand, with refined poses and the depth bias removed; read when
     asked."""
     views: tuple[ViewPoints, ...]
@@ -172,7 +162,12 @@ def _refine_once(
     constants: RefineConfig,
     config: RegistrationConfig,
     progress: Callable[[int, int], None] | None,
-) -> tuple[Refined, tuple[tuple[DepthFrame, ...], tuple[ViewPoints, ...]], list[Cloud], list[Kept]]:
+) -> tuple[
+    Refined,
+    tuple[tuple[evidence.DepthFrame, ...], tuple[ViewPoints, ...]],
+    list[evidence.Cloud],
+    list[Kept],
+]:
     """Return one refinement from rough poses, corrected frames and clouds, and the final poses."""
     rough, claimed = poses
     refined = refine(
@@ -181,7 +176,7 @@ def _refine_once(
     scale = float(refined.state.bias[0])
     hand = len(intake.frames)
     frames = tuple(
-        correct_frame(f, T, DepthBias(scale=scale, offset_per_m=float(offset)))
+        evidence.correct_frame(f, T, DepthBias(scale=scale, offset_per_m=float(offset)))
         for f, T, offset in zip(
             intake.frames, refined.cameras[:hand], refined.state.offsets()[:hand], strict=True
         )
@@ -203,7 +198,7 @@ def _keep_blind(
     body: Body,
     claimed: Body | None,
     T: Array,
-    data: tuple[Cloud, Comparer],
+    data: tuple[evidence.Cloud, Comparer],
     config: RegistrationConfig,
 ) -> Kept:
     """Return the refined pose with its blind turns as they were claimed."""
@@ -231,7 +226,7 @@ def _turn_covariance(C: Array, S: Array) -> Array:
 
 def comparer_on(
     intake: Intake,
-    frames: Sequence[DepthFrame],
+    frames: Sequence[evidence.DepthFrame],
     plane: SupportPlane | None,
     bodies: Sequence[Body],
     poses: Sequence[Array] | Array,
@@ -241,7 +236,7 @@ def comparer_on(
         center = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
     else:
         center = np.zeros(3) if plane is None else plane.T_world_table[:3, 3]
-    chosen = [read_frame(f) for f in spread_frames(frames, center, FRAMES)]
+    chosen = [evidence.read_frame(f) for f in spread_frames(frames, center, FRAMES)]
     return make_comparer(intake.intrinsics, chosen, intake.noise, plane, RAYS)
 
 
@@ -269,28 +264,28 @@ def _blind_covariance(body: Body, fit: PoseFit, config: RegistrationConfig) -> A
 
 def _clouds(
     intake: Intake, views: Sequence[ViewPoints], bodies: Sequence[Body], refined: Refined
-) -> list[Cloud]:
+) -> list[evidence.Cloud]:
     """Return each object's averaged points, cameras and depth as refined."""
     total = sum(len(v.points) for v in views)
     every = max(1, -(-total // CLOUD_POINTS))
     parts = [_points_near(v, (bodies, refined.poses), every, v.noise(intake.noise)) for v in views]
-    near: list[Cloud] = []
+    near: list[evidence.Cloud] = []
     for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
-        cloud = join_clouds([p[k] for p in parts])
-        above = without_table(cloud, refined.plane, drop_height(body, refined.plane))
-        near.append(average_cloud(above, T, fine_voxel(body)))
+        cloud = evidence.join_clouds([p[k] for p in parts])
+        above = evidence.without_table(cloud, refined.plane, drop_height(body, refined.plane))
+        near.append(evidence.average_cloud(above, T, fine_voxel(body)))
     return assign_points(bodies, list(refined.poses), near)
 
 
 def _points_near(
-    view: ViewPoints, objects: tuple[Sequence[Body], Array], every: int, noise: DepthNoise
-) -> list[Cloud]:
+    view: ViewPoints, objects: tuple[Sequence[Body], Array], every: int, noise: evidence.DepthNoise
+) -> list[evidence.Cloud]:
     """Return of one view, per object, the points near it in world."""
     p = view.points[::every].astype(np.float64)
     world = se3.transform(view.T_world_cam, p)
-    out: list[Cloud] = []
+    out: list[evidence.Cloud] = []
     for body, T in zip(*objects, strict=True):
         close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + ASSIGN_M
         sigmas = noise.sigma(p[close, 2])
-        out.append(seen_cloud(world[close], view.T_world_cam[:3, 3], sigmas))
+        out.append(evidence.seen_cloud(world[close], view.T_world_cam[:3, 3], sigmas))
     return out

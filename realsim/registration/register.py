@@ -19,26 +19,13 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
-from realsim.registration import reports, second_look
+from realsim.registration import finding, reports, second_look
 from realsim.registration.blind import Kept, Uncertainty, uncertainty
 from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import spread_frames
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import few_around, register_few, with_photograph
-from realsim.registration.finding import (
-    FoundObjects,
-    Progress,
-    SceneTask,
-    Ticker,
-    claimed_bodies,
-    in_units,
-    models_in_units,
-    seek_objects,
-    wanted_objects,
-    with_flat,
-    without_objects,
-)
 from realsim.registration.fixed_cameras import FixedFrames
 from realsim.registration.intake import check_odometry, take_in, without_fixed
 from realsim.registration.judge import Defect, Poses, judge_objects
@@ -72,7 +59,7 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     *,
     fixed: Sequence[FixedFrames] = (),
     gravity_up_world: ArrayLike | None = None,
-    progress: Progress | None = None,
+    progress: finding.Progress | None = None,
     told: Callable[[str], None] | None = None,
 ) -> Registration:
     """Return the pose of every object in world from all depth frames together.
@@ -97,20 +84,20 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     config = config or RegistrationConfig()
     if config.method not in METHODS:
         raise InputError(f"the method is '{config.method}'; {' or '.join(METHODS)} is accepted.")
-    asked = wanted_objects(models, wanted)
+    asked = finding.wanted_objects(models, wanted)
     sought = len(models if asked is None else asked)
-    tick = Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
+    tick = finding.Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
     intake = take_in(intrinsics, frames, config, up, tick, fixed)
-    asked, refused = in_units(models, asked, intake)
+    asked, refused = finding.in_units(models, asked, intake)
     if asked is None:
-        models, refused = models_in_units(models, intake)
+        models, refused = finding.models_in_units(models, intake)
     kinematics = None
     if config.odometry:
         kinematics, why_not = check_odometry(intake, config)
         if why_not is not None:
             intake = replace(intake, findings=(*intake.findings, why_not))
-    task = SceneTask(name, intake, models, config, up, tick, kinematics, {})
+    task = finding.SceneTask(name, intake, models, config, up, tick, kinematics, {})
     if asked is not None:
         task = task.symmetric(w.obj_id for w in asked)
     result = _sought(task, asked, tuple(refused))
@@ -118,10 +105,10 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
 
 
 def _sought(
-    task: SceneTask, asked: list[Wanted] | None, refused: tuple[NotPlaced, ...]
+    task: finding.SceneTask, asked: list[Wanted] | None, refused: tuple[NotPlaced, ...]
 ) -> Registration:
     """Return what was found, fitted and judged."""
-    found = seek_objects(task, asked)
+    found = finding.seek_objects(task, asked)
     missing = (*refused, *found.not_placed)
     if not found.bodies:
         return _nothing(task, found, missing)
@@ -133,14 +120,14 @@ def _sought(
     task, found, fit = _fit_many(task, found, asked or ())
     if before is not None and task.intake.plane is None:
         # What was sought on a table that is not there is sought again.
-        task, found, fit = _fit_many(task, seek_objects(task, asked), asked or ())
+        task, found, fit = _fit_many(task, finding.seek_objects(task, asked), asked or ())
     missing = (*refused, *found.not_placed)
     result = _registration(task, found, missing, fit)
     bad = {o.instance for o in result.scene.objects if is_wrong(o)}
     if not bad or len(bad) == len(found.bodies):
         return result
     # What is not there must not pull the cameras.
-    task, rest, fit = _fit_many(task, without_objects(found, bad), ())
+    task, rest, fit = _fit_many(task, finding.without_objects(found, bad), ())
     return with_rejected(_registration(task, rest, missing, fit), result, bad)
 
 
@@ -168,8 +155,8 @@ class _Fit:
 
 
 def _fit_many(
-    task: SceneTask, found: FoundObjects, asked: Sequence[Wanted]
-) -> tuple[SceneTask, FoundObjects, _Fit]:
+    task: finding.SceneTask, found: finding.FoundObjects, asked: Sequence[Wanted]
+) -> tuple[finding.SceneTask, finding.FoundObjects, _Fit]:
     """Return everything refined together, without a table and views that the fit contradicts.
 
     The objects are those given and the flat ones that only refined views show.
@@ -190,10 +177,10 @@ def _fit_many(
     if looked is not intake:
         intake, task = looked, replace(task, intake=looked)
         many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
-    if (more := with_flat(task, found, many, asked)) is not None:
+    if (more := finding.with_flat(task, found, many, asked)) is not None:
         found = more
         many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
-    claimed, starts = claimed_bodies(found), _starts(found)
+    claimed, starts = finding.claimed_bodies(found), _starts(found)
     fought = _duels(found, many)
     if any(_is_lost(d) for d in fought):
         found = _with_rivals(found, fought)
@@ -231,9 +218,9 @@ def _fit_many(
     )  # fmt: skip
 
 
-def _starts(found: FoundObjects) -> list[Body | None]:
+def _starts(found: finding.FoundObjects) -> list[Body | None]:
     """Return the bodies at the starts that somebody claimed; None = nobody did."""
-    claimed = zip(claimed_bodies(found), found.claimed, strict=True)
+    claimed = zip(finding.claimed_bodies(found), found.claimed, strict=True)
     return [None if T is None else body for body, T in claimed]
 
 
@@ -256,7 +243,7 @@ def _is_lost(fought: Duel | None) -> bool:
     return contrast is not None and contrast < -CONTRAST_DECIDED
 
 
-def _duels(found: FoundObjects, many: ManyViews) -> list[Duel | None]:
+def _duels(found: finding.FoundObjects, many: ManyViews) -> list[Duel | None]:
     """Return how every pose compares with its near-symmetric rival, cameras refined."""
     poses, misfits = many.refined.poses, many.refined.misfit_m[:-1]
     rivals = _moved_rivals(found, poses)
@@ -266,7 +253,7 @@ def _duels(found: FoundObjects, many: ManyViews) -> list[Duel | None]:
     ]
 
 
-def _moved_rivals(found: FoundObjects, poses: Iterable[Array]) -> list[Array | None]:
+def _moved_rivals(found: finding.FoundObjects, poses: Iterable[Array]) -> list[Array | None]:
     """Return the rival of every object that has one, moved as the object was."""
     return [
         None if R is None else T @ se3.invert(b.T_start) @ R
@@ -275,7 +262,10 @@ def _moved_rivals(found: FoundObjects, poses: Iterable[Array]) -> list[Array | N
 
 
 def _print_duels(
-    task: SceneTask, found: FoundObjects, many: ManyViews, fought: Sequence[Duel | None]
+    task: finding.SceneTask,
+    found: finding.FoundObjects,
+    many: ManyViews,
+    fought: Sequence[Duel | None],
 ) -> tuple[list[float | None], list[Duel | None]]:
     """Return the contrasts, those that depth leaves open settled by the print, and its duels."""
     contrasts = [
@@ -289,7 +279,9 @@ def _print_duels(
     return duels_by_print(bodies, rivals, contrasts, intake, task.config)
 
 
-def _with_rivals(found: FoundObjects, fought: Sequence[Duel | None]) -> FoundObjects:
+def _with_rivals(
+    found: finding.FoundObjects, fought: Sequence[Duel | None]
+) -> finding.FoundObjects:
     """Return the objects with poses and rivals exchanged where the rival is the better one."""
     bodies, rivals = list(found.bodies), list(found.rivals)
     for n, d in enumerate(fought):
@@ -299,13 +291,13 @@ def _with_rivals(found: FoundObjects, fought: Sequence[Duel | None]) -> FoundObj
     return replace(found, bodies=bodies, rivals=rivals)
 
 
-def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
+def _fit_few(task: finding.SceneTask, found: finding.FoundObjects) -> _Fit:
     """Return the objects fitted with the cameras at their word."""
     intake, config = task.intake, task.config
     contrasts, fought = duels_by_print(found.bodies, found.rivals, found.contrasts, intake, config)
     found = replace(_with_rivals(found, fought), contrasts=contrasts)
     few = register_few(intake, found.bodies, config, task.up, task.tick)
-    claimed = claimed_bodies(found)
+    claimed = finding.claimed_bodies(found)
     intake, few, photo = with_photograph(intake, few, claimed, config)
     kept, tried = few.kept, list[Around]()
     if len(intake.frames) < config.refine_from:
@@ -337,7 +329,9 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     )  # fmt: skip
 
 
-def _nothing(task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
+def _nothing(
+    task: finding.SceneTask, found: finding.FoundObjects, missing: tuple[NotPlaced, ...]
+) -> Registration:
     """Return the registration of a scene in which nothing was found."""
     scene = Scene(name=task.name, objects=(), plane=task.intake.plane)
     return Registration(
@@ -352,7 +346,7 @@ def _nothing(task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...
 
 
 def _registration(
-    task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...], fit: _Fit
+    task: finding.SceneTask, found: finding.FoundObjects, missing: tuple[NotPlaced, ...], fit: _Fit
 ) -> Registration:
     """Return the objects judged, with the paper's way beside them."""
     given, intake, config = fit.poses, task.intake, task.config

@@ -18,14 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import vertex_normals
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
 from realsim.registration.evidence import DepthNoise
-from realsim.scanning.fusion.evidence import (
-    LEAST_FRAMES,
-    Crops,
-    checked_frames,
-    cropped,
-    fitted_to_noise,
-    measured_noise,
-)
+from realsim.scanning.fusion import evidence
 from realsim.scanning.fusion.patches import observed_object, observed_table, view_points
 from realsim.scanning.fusion.refine import PoseState, refined_twists, start_state
 from realsim.scanning.fusion.region import Region, find_region
@@ -117,7 +110,7 @@ def aligned(
             lost.append(correction)
         numbers = {w[0] for w in wrong}
         used = [f for i, f in enumerate(used) if i not in numbers]
-        if len(used) < LEAST_FRAMES:
+        if len(used) < evidence.LEAST_FRAMES:
             raise DegenerateError(
                 f"only {len(used)} of {len(frames)} views agree with each other (left out: "
                 f"{', '.join(str(i) for i, _ in left_out)}). Did the object move between the "
@@ -139,7 +132,9 @@ def _rounds(
     wide = np.array([TABLE_MARGIN_M, TABLE_MARGIN_M, 0.0])
     T_world_table = region.plane.T_world_table
     given = np.stack([f.T_world_cam for f in frames])
-    crops = cropped(intrinsics, frames, (T_world_table, low - wide, high + wide), noise, config)
+    crops = evidence.cropped(
+        intrinsics, frames, (T_world_table, low - wide, high + wide), noise, config
+    )
     cell = COARSE_CELLS * config.voxel_m
     heights = (cut_height(region, config) + cell, config.plane_tolerance_m)
     Ts_table_cam = se3.invert(T_world_table) @ given
@@ -258,9 +253,9 @@ def fuse_object(
         DegenerateError: no table, or views that do not agree.
     """
     started = time.process_time()
-    usable, notes = checked_frames(frames, intrinsics)
-    noise = measured_noise(usable, config)
-    config = fitted_to_noise(usable, noise, config)
+    usable, notes = evidence.checked_frames(frames, intrinsics)
+    noise = evidence.measured_noise(usable, config)
+    config = evidence.fitted_to_noise(usable, noise, config)
     region = find_region(intrinsics, usable, noise, config)
     alignment = aligned(intrinsics, usable, region, noise, config)
     low, high = volume_box(region, config)
@@ -275,7 +270,7 @@ def fuse_object(
         replace(f, T_world_cam=T)
         for f, T in zip(alignment.frames, alignment.Ts_world_cam, strict=True)
     ]
-    crops = cropped(intrinsics, moved, (T_world_table, low, high), noise, config)
+    crops = evidence.cropped(intrinsics, moved, (T_world_table, low, high), noise, config)
     Ts_cam_table = se3.invert(alignment.Ts_world_cam) @ T_world_table
     volume = fused_volume(crops, Ts_cam_table, (low, high, cell), alignment.coarse, config)
     surface = closed_surface(volume, cut_height(region, config), config)
@@ -290,7 +285,7 @@ def _voxel(low: Array, high: Array, config: FusionConfig) -> float:
 
 def _judged(
     surface: Surface,
-    crops: Crops,
+    crops: evidence.Crops,
     Ts_cam_table: Array,
     alignment: Alignment,
     so_far: tuple[tuple[str, ...], list[str], float],
@@ -400,7 +395,9 @@ def _verdict(
     return ("doubtful" if reasons else "accepted"), tuple(reasons)
 
 
-def _report(surface: Surface, crops: Crops, alignment: Alignment, sigma: Array) -> dict[str, Any]:
+def _report(
+    surface: Surface, crops: evidence.Crops, alignment: Alignment, sigma: Array
+) -> dict[str, Any]:
     """Return the figures of all steps as plain JSON values."""
     shifts = [c.shift_mm for c in alignment.corrections if c.used]
     turns = [c.turn_deg for c in alignment.corrections if c.used]
