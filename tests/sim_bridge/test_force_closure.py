@@ -35,17 +35,17 @@ from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts, pad_heights
 from realsim_sim_bridge.grasping.surroundings import hands_free, surface_tree
 from refusals import refused
-from trimesh_solids import box, cup, solid, wedge
+from trimesh_solids import ball, box, cup, wedge
 
 HAND = find_hand()
 CUBE = (0.05, 0.05, 0.05)
 
 
-def grasps(mesh):
-    T = se3.from_translation([0.0, 0.0, -mesh.vertices[:, 2].min()])
-    config, rng = CandidateConfig(surface_points=200), np.random.default_rng(0)
-    found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, 80)
-    return found.Ts_obj_grasp, found.openings_m
+def candidates(mesh, height=0.025, surroundings=None, hand=HAND, count=60, **config):
+    """Return grasps of an object whose origin is at a height over the table [m]."""
+    T, config = se3.from_translation([0.0, 0.0, height]), {"surface_points": 400} | config
+    around, rng = surroundings or Surroundings(), np.random.default_rng(0)
+    return sample_candidates(mesh, T, around, CandidateConfig(**config), hand, rng, count)
 
 
 def random_contacts(n, seed):
@@ -61,7 +61,8 @@ def random_contacts(n, seed):
 
 def test_nothing_changes_when_object_and_grasps_move_together():
     mesh = cup()
-    Ts, openings = grasps(mesh)
+    found = candidates(mesh, -mesh.vertices[:, 2].min(), count=80, surface_points=200)
+    Ts, openings = found.Ts_obj_grasp, found.openings_m
     T = se3.exp([0.8, -0.3, 1.1, 0.2, -0.1, 0.3])
     here = force_closure(mesh, Ts, openings)
     turned = replace(mesh, vertices=se3.transform(T, mesh.vertices))
@@ -152,12 +153,6 @@ def test_impossible_input_is_named():
 # --- Antipodal candidates: their geometry, what is filtered, and that chance is the seed's alone.
 
 
-def candidates(mesh, height=0.025, surroundings=None, hand=HAND):
-    T, config = se3.from_translation([0.0, 0.0, height]), CandidateConfig(surface_points=400)
-    rng = np.random.default_rng(0)
-    return sample_candidates(mesh, T, surroundings or Surroundings(), config, hand, rng, 60)
-
-
 def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
     found = candidates(box(CUBE))
     assert 0 < len(found.widths_m) <= 60
@@ -230,14 +225,11 @@ def test_boxes_free_agrees_with_looking_at_each_point():
 
 
 def test_contacts_nearer_to_the_tips_let_the_fingers_clear_a_table():
-    plate = box((0.04, 0.04, 0.02))
-    T = se3.from_translation([0.0, 0.0, 0.01])
-    found = {}
-    for depths in ((0.0,), (0.0, 0.003, 0.006)):
-        config = CandidateConfig(surface_points=300, contact_depths_m=depths)
-        rng = np.random.default_rng(0)
-        found[depths] = sample_candidates(plate, T, Surroundings(), config, HAND, rng, 10**6)
-    centred, shifted = found.values()
+    plate, few = box((0.04, 0.04, 0.02)), {"surface_points": 300, "count": 10**6}
+    centred, shifted = (
+        candidates(plate, 0.01, contact_depths_m=depths, **few)
+        for depths in ((0.0,), (0.0, 0.003, 0.006))
+    )
     assert shifted.counts["free"] > 1.5 * centred.counts["free"]
     assert set(shifted.contact_depths_m.tolist()) == {0.0, 0.003, 0.006}
     # Who can stand centred does.
@@ -276,12 +268,8 @@ def pairs_of(mesh, config=CONFIG, max_width=0.078, seed=0):
     return antipodal_pairs(RaySurface(mesh), config, max_width, rng, counts), counts
 
 
-def sphere(radius=0.03):
-    return solid(trimesh.creation.icosphere(subdivisions=5, radius=radius))
-
-
 def test_both_ends_lie_on_the_surface_and_the_line_is_inside_both_cones():
-    pairs, _ = pairs_of(sphere())
+    pairs, _ = pairs_of(ball(0.03, 5))
     assert np.allclose(np.linalg.norm(pairs.points, axis=-1), 0.03, atol=1e-4)
     line = pairs.points[:, 1] - pairs.points[:, 0]
     line = line / pairs.widths_m[:, None]
@@ -312,7 +300,7 @@ def test_a_mesh_whose_triangles_all_face_inwards_has_the_same_pairs():
 
 def test_an_open_mesh_with_triangles_of_either_orientation_keeps_its_pairs():
     rng = np.random.default_rng(3)
-    mesh = solid(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
+    mesh = ball(0.03)
     whole, _ = pairs_of(mesh)
     faces = mesh.faces[rng.random(len(mesh.faces)) > 0.03].copy()
     turned = rng.random(len(faces)) < 0.4
@@ -325,9 +313,9 @@ def test_an_open_mesh_with_triangles_of_either_orientation_keeps_its_pairs():
 
 
 def test_averaged_normals_are_nearer_to_the_truth_on_a_noisy_scan():
-    ball, rng = sphere(), np.random.default_rng(0)
-    noise = rng.normal(scale=1e-4, size=ball.vertices.shape)
-    scan = replace(ball, vertices=ball.vertices + noise)
+    smooth = ball(0.03, 5)
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=smooth.vertices.shape)
+    scan = replace(smooth, vertices=smooth.vertices + noise)
     errors = {}
     for radius in (0.0, CONFIG.normal_radius_m):
         pairs, _ = pairs_of(scan, replace(CONFIG, normal_radius_m=radius))
@@ -347,14 +335,9 @@ def test_a_double_surface_gives_no_pair_across_its_layers_and_one_exit_per_wall(
 @pytest.mark.parametrize("friction", [0.2, 1.0])
 def test_a_wedge_closes_only_where_friction_exceeds_the_tangent_of_its_half_angle(friction):
     a = np.radians(20)
-    outline = np.array([[0.0, -0.002], [0.06, -0.002 - 0.06 * np.tan(a)]])
-    outline = np.concatenate([outline, outline[::-1] * [1, -1]])
-    prism = trimesh.creation.extrude_triangulation(
-        outline, np.array([[0, 1, 2], [0, 2, 3]]), height=0.04
-    )
     # Rays along the normals only: from one slope to the other they are 40 deg off there.
     config = replace(CONFIG, friction=friction, rays_per_point=4)
-    pairs, _ = pairs_of(solid(prism), config)
+    pairs, _ = pairs_of(wedge(a, 0.06, 0.002, 0.02), config)
     slope_pairs = np.sum((np.abs(pairs.normals[:, :, 1]) > 0.5).all(axis=1))
     assert slope_pairs == 0 if friction < np.tan(a) else slope_pairs > 50
 

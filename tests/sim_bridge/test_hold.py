@@ -4,7 +4,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.special import ndtr
 
 from graspa_folders import DOWN
@@ -30,7 +29,7 @@ from realsim_sim_bridge.slip.motion import SlipMotion, stage_loads, stage_wrench
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.validation.specimens import ready_trial
 from refusals import refused
-from trimesh_solids import solid
+from trimesh_solids import ball, box
 
 HAND, MASS, FORCE = find_hand(), 0.4, 70.0
 STILL = PoseSpread(across_m=0.0, height_m=0.0, yaw_deg=0.0, tilt_deg=0.0)
@@ -38,7 +37,7 @@ CERTAIN = HoldConfig(
     draws=2, spread=STILL, friction=(0.5,), force_share=(0.999, 1.0), mass_spread=0.0,
     stiffness_spread=0.0,
 )  # fmt: skip
-BAR = solid(trimesh.creation.box((0.12, 0.05, 0.05)))
+BAR = box((0.12, 0.05, 0.05))
 
 
 def bar_trial(off_m, hand=HAND, z=0.005, mass=MASS):
@@ -138,9 +137,9 @@ def test_a_draw_without_spread_says_what_the_nominal_safety_says(bar):
 
 
 def test_point_contacts_on_a_ball_are_overloaded_by_a_torque_not_skewed():
-    ball = GraspedObject.of(solid(trimesh.creation.icosphere(3, 0.025)))
+    round_one = GraspedObject.of(ball(0.025, 3))
     trial = bar_trial(np.array([0.0, 0.004]), z=0.0)
-    found = draws_of(ball, trial, replace(CERTAIN, conformity_m=0.0), np.inf)
+    found = draws_of(round_one, trial, replace(CERTAIN, conformity_m=0.0), np.inf)
     assert found.skewed.sum() == 0 and found.overloaded[1] == 1.0
 
 

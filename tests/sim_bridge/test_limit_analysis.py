@@ -4,14 +4,13 @@ import time
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.optimize import linprog
 
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.limit_analysis import PadPatches, pad_patches, safety_factors
-from trimesh_solids import solid
+from trimesh_solids import box
 
 HAND = find_hand()
 EDGE = np.sqrt(2 * np.pi / (8 * np.sin(np.pi / 4)))  # polygon of the circle's area, at its corners
@@ -180,7 +179,7 @@ def test_a_wedge_steeper_than_its_friction_is_squeezed_out():
 
 
 def test_hands_on_an_object_beside_it_and_half_on_it():
-    surface = RaySurface(solid(trimesh.creation.box((0.05, 0.05, 0.05))))
+    surface = RaySurface(box((0.05, 0.05, 0.05)))
     places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.032, 0.0, 0.0]])
     Ts = se3.from_rt(np.tile(np.eye(3), (3, 1, 1)), places)
     p = pad_patches(surface, Ts, np.full(3, 0.07), HAND, 0.001)
