@@ -58,8 +58,8 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     if image is None:
         raise InputError(
             f"{path} is {'truncated' if torn or not data else 'not a readable image'} "
-            f"({len(data)} bytes). Delete this file and its view, and capture the view again, or "
-            "copy the file again from where it came."
+            f"({len(data)} bytes). Copy the file again from where it came; of a capture, delete it "
+            "and its view, and capture the view again."
         )
     return np.asarray(image)
 

@@ -426,7 +426,8 @@ def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:
     )  # fmt: skip
     if result.not_attempted:
         console.say(
-            f"{result.not_attempted} grasps were not attempted: the arm does not get there."
+            f"{result.not_attempted} of the session's grasps have no attempt: the arm does not get "
+            "there."
         )
     console.warn(*shortened(w.notes, 10, "and {} more notes, in realsim/episodes.jsonl."))
     console.say(f"page      {result.page}")
