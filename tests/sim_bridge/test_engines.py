@@ -32,6 +32,7 @@ from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, Replay, SlipBody, SlipPhysics
+from realsim_sim_bridge.validation.loads import hold, with_hand
 from realsim_sim_bridge.validation.specimens import cube_trial
 from refusals import refused
 from trimesh_solids import box
@@ -123,6 +124,29 @@ def test_a_stiffness_that_cannot_be_is_refused_with_what_can():
     trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.1)
     met = trial.met(SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5)), find_hand())
     refused("shorter step_s", make_engine(long).world, met, trial.grips(0.004))
+
+
+@pytest.mark.parametrize(
+    ("name", "force_n", "friction", "direction", "within", "held_mm", "slipped_mm"),
+    [
+        ("pybullet", 2.0, 0.25, (1, 0, 0), 0.1, 1.0, 2.0),
+        ("pybullet", 70.0, 1.0, (0.7071, 0, -0.7071), 0.1, 1.0, 2.0),
+        ("pybullet", 20.0, 0.25, (0, 0, -1), 0.03, 1.0, 1.0),
+        ("mujoco", 2.0, 0.25, (0, 0, -1), 0.03, 0.03, 1.0),
+        ("mujoco", 20.0, 0.25, (0.7071, 0, -0.7071), 0.03, 0.03, 1.0),
+    ],
+)
+def test_coulomb_s_limit_along_the_pad(
+    name, force_n, friction, direction, within, held_mm, slipped_mm
+):
+    config = with_hand(SlipConfig(), force_n, friction)
+    limit = 2 * friction * force_n * np.array([0, 0, 0, *direction])
+    loads = np.outer([1 - within, 1 + within], limit)
+    engine, body = make_engine(settings_of(name)), held_box(0.3)
+    found = hold(engine, config, find_hand(), body, loads, ramp_s=0.125, hold_s=0.5)
+    np.testing.assert_allclose(found.finger_n, force_n, rtol=0.02)
+    below_mm, above_mm = 1e3 * found.shift_m
+    assert below_mm < held_mm <= slipped_mm < above_mm
 
 
 def test_pads_of_an_arc_are_where_it_has_them_while_they_close():

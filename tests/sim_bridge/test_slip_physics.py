@@ -68,37 +68,6 @@ def test_too_weak_a_squeeze_fails_in_the_lift_and_70_newton_hold():
     assert score(strong)[0] == 1.0 and strong.slip_m.max() < 1e-3
 
 
-def hold(load_share, force_n, friction, direction):
-    """Return how far a cube moves in 0.5 s under a share of Coulomb's limit 2 mu F."""
-    physics = SlipPhysics(force_n=force_n, friction=friction)
-    t = trial(mass=0.3)
-    engine = BulletEngine(BulletSettings())
-    with engine.world(t.met(physics, find_hand()), t.grips(0.004)) as world:
-        closed = world.close(Closing())
-        assert np.allclose(closed.finger_n[0, -1], force_n, rtol=0.02)
-        start = world.states().Ts_world_body
-        load = load_share * 2 * friction * force_n * np.asarray(direction)
-        ramp = np.minimum(1.0, np.arange(150) / 30)  # a step would overshoot
-        wrenches = np.zeros((1, 150, 6))
-        wrenches[0, :, 3:] = ramp[:, None] * load
-        now = world.play(wrenches, 150, 1.0).Ts_world_body[:, -1]
-    return float(np.linalg.norm(now[0, :3, 3] - start[0, :3, 3]))
-
-
-@pytest.mark.parametrize(
-    ("force_n", "friction", "direction"),
-    [(2.0, 0.25, (1, 0, 0)), (70.0, 1.0, (0.7071, 0, -0.7071))],
-)
-def test_coulomb_s_limit_along_the_pad(force_n, friction, direction):
-    assert hold(0.9, force_n, friction, direction) < 1e-3
-    assert hold(1.1, force_n, friction, direction) > 2e-3
-
-
-def test_the_limit_is_met_within_three_percent():
-    assert hold(0.97, 20.0, 0.25, (0, 0, -1)) < 1e-3
-    assert hold(1.03, 20.0, 0.25, (0, 0, -1)) > 1e-3
-
-
 def test_light_objects_are_held_and_carry_their_true_weight():
     assert run(mass=0.013).slip_m.max() < 1e-3
     # 2 * 0.05 * 1 N = 0.1 N carries 13 g x 9.81 = 0.128 N no more, although the engine's mass is
