@@ -203,28 +203,23 @@ def test_a_camera_beside_the_robot_with_lens_and_depth(tmp_path: Path) -> None:
 # --- The pictures of a calibration's page: what they are drawn from, and what stands in them.
 
 
-@pytest.fixture(scope="module")
-def plain_report() -> HandEyeReport:
-    return arm_calibration()
-
-
 @pytest.mark.parametrize(
     ("mode", "tilt", "azimuth", "roll"),
     [("eye_in_hand", 0, 0, 30), ("eye_in_hand", 25, 60, -40), ("eye_to_hand", 50, -120, 170)],
 )
 def test_viewpoint_of_a_known_camera(
-    plain_report: HandEyeReport, mode: Mode, tilt: float, azimuth: float, roll: float
+    report: HandEyeReport, mode: Mode, tilt: float, azimuth: float, roll: float
 ) -> None:
     t, a, r = np.radians([tilt, azimuth, roll])
-    middle = np.array([*plain_report.target.size_m, 0]) / 2
+    middle = np.array([*report.target.size_m, 0]) / 2
     # A camera that looks straight down on the page, tilted about the target's middle, then rolled.
     R = se3.exp_so3(t * np.array([-np.sin(a), np.cos(a), 0])).T @ se3.exp_so3([0, 0, -r])
     T_board_cam = se3.from_rt(R, middle - 0.4 * R[:, 2])
-    A = plain_report.Z @ T_board_cam @ se3.invert(plain_report.X)
+    A = report.Z @ T_board_cam @ se3.invert(report.X)
     if mode == "eye_to_hand":
-        A = plain_report.X @ se3.invert(T_board_cam) @ se3.invert(plain_report.Z)
-    changed = replace(plain_report, mode=mode, robot_map=None)
-    view = replace(plain_report.views[0], T_base_ee=A)
+        A = report.X @ se3.invert(T_board_cam) @ se3.invert(report.Z)
+    changed = replace(report, mode=mode, robot_map=None)
+    view = replace(report.views[0], T_base_ee=A)
     np.testing.assert_allclose(camera_in_board(changed, view), T_board_cam, atol=1e-9)
     p = viewpoint(changed, view)
     assert p.distance_m == pytest.approx(0.4, abs=1e-9)
@@ -237,24 +232,24 @@ def test_viewpoint_of_a_known_camera(
 
 def test_the_arms_map_explains_most_of_the_error() -> None:
     """Errors of a milliradian per joint: what the solver's map leaves is a fraction of them."""
-    plain_report = arm_calibration(with_joints=True)
-    assert isinstance(plain_report.robot_map, ArmErrorMap) and plain_report.map_name == "arm"
-    rests = [rest_of_map(plain_report, v) for v in plain_report.used]
+    report = arm_calibration(with_joints=True)
+    assert isinstance(report.robot_map, ArmErrorMap) and report.map_name == "arm"
+    rests = [rest_of_map(report, v) for v in report.used]
     left = np.array([r for r in rests if r is not None])
-    whole = np.array([v.robot_error for v in plain_report.used])
+    whole = np.array([v.robot_error for v in report.used])
     assert len(left) == len(whole)
     for part in (slice(0, 3), slice(3, 6)):
         assert np.linalg.norm(left[:, part]) < 0.4 * np.linalg.norm(whole[:, part])
-    unknown = replace(plain_report.used[0], joints=None)
-    assert rest_of_map(plain_report, unknown) is None
-    assert np.array_equal(corrected(plain_report, unknown), unknown.T_base_ee)
+    unknown = replace(report.used[0], joints=None)
+    assert rest_of_map(report, unknown) is None
+    assert np.array_equal(corrected(report, unknown), unknown.T_base_ee)
 
 
 def test_camera_poses_of_an_arm_s_calibration_need_joints() -> None:
-    plain_report = arm_calibration(with_joints=True)
-    hand_eye = plain_report.hand_eye
+    report = arm_calibration(with_joints=True)
+    hand_eye = report.hand_eye
     assert isinstance(hand_eye, HandEye)
-    view = plain_report.used[0]
+    view = report.used[0]
     refused("joint angles are needed", hand_eye.camera_poses, view.T_base_ee)
     T = hand_eye.camera_poses(view.T_base_ee, view.joints)
     moved = se3.log(se3.invert(view.T_base_ee @ hand_eye.T_ee_cam) @ T)
@@ -267,26 +262,26 @@ def test_names_that_the_font_lacks() -> None:
     assert style.view_label("Übersicht_é.png", 7) == "Übersicht_é.png"
 
 
-def test_pictures_have_no_letters_that_the_font_lacks(plain_report: HandEyeReport) -> None:
+def test_pictures_have_no_letters_that_the_font_lacks(report: HandEyeReport) -> None:
     odd = tuple(
         replace(v, label=f"图像_{v.index}.png", reason="没有" if v.reason else "")
-        for v in plain_report.views
+        for v in report.views
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with style.paper_style():  # a letter that the font lacks would be a warning, here an error
-            figure = plot_views(replace(plain_report, views=odd))
+            figure = plot_views(replace(report, views=odd))
             figure.savefig(out := io.BytesIO(), format="png")
     assert out.getvalue().startswith(b"\x89PNG")
     shown = "".join(text.get_text() for text in figure.findobj(Text))
     assert "view " in shown and "图" not in shown
 
 
-def test_sigma_is_given_along_the_axes_of_the_carrier(plain_report: HandEyeReport) -> None:
+def test_sigma_is_given_along_the_axes_of_the_carrier(report: HandEyeReport) -> None:
     """A camera turned by 90 deg about z: its x is the tool's y, so is its uncertainty."""
     X = se3.from_rt(se3.exp_so3([0, 0, np.pi / 2]), [0.01, 0.02, 0.03])
     C = np.diag([1e-8, 1e-8, 1e-8, 9e-6, 1e-6, 4e-6])
-    row = pose_rows(replace(plain_report, X_here=X, X_here_covariance=C))[0]
+    row = pose_rows(replace(report, X_here=X, X_here_covariance=C))[0]
     assert row[1] == "x 10.000 ± 1.000, y 20.000 ± 3.000, z 30.000 ± 2.000"
 
 

@@ -1,13 +1,12 @@
 import json
-import os
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fault_sessions import faults
+from real_data import DATA, needs
 from realsim.errors import NotRigidError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5 as UR5_ARM
@@ -351,9 +350,7 @@ def test_the_predicted_sigma_is_that_of_repeated_sessions():
 
 # --- Conventions and faults named in the poses of a real UR5.
 
-ROOT = Path(__file__).parents[2]
-KOCH = Path(os.environ.get("REALSIM_DATA", ROOT / "../shared/data")) / "handeye" / "koch_ur5"
-real = pytest.mark.skipif(not KOCH.is_dir(), reason=f"no real data at {KOCH} (set REALSIM_DATA)")
+KOCH = DATA / "handeye/koch_ur5"
 
 
 @pytest.fixture(scope="module")
@@ -366,7 +363,7 @@ def koch():
     return A, C, np.radians(meta["joints"])
 
 
-@real
+@needs(KOCH)
 @pytest.mark.real
 def test_a_real_ur5_is_sound_and_its_tool_is_named(koch):
     A, C, joints = koch
@@ -376,7 +373,7 @@ def test_a_real_ur5_is_sound_and_its_tool_is_named(koch):
     assert np.allclose(offset.offsets[0][:3, 3], [0, 0, 0.2007], atol=1.5e-3)
 
 
-@real
+@needs(KOCH)
 @pytest.mark.real
 def test_millimetres_of_a_real_file_are_named(koch):
     A, C, _ = koch

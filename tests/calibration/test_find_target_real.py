@@ -1,7 +1,5 @@
 """Targets in real pictures: everything is found, and OpenCV's own points fit a camera no better."""
 
-import os
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+import real_data
 from realsim.app.calibrate.images import require_target
 from realsim.records.targets import CharucoBoard, CircleGrid
 from realsim_calibration.detect.drawings import DRAWN
@@ -16,12 +15,8 @@ from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import fit_homography, seen_from_front
 from refusals import refused
 
-ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-DATA = ROOT / "handeye"
-pytestmark = [
-    pytest.mark.real,
-    pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA} (set REALSIM_DATA)"),
-]
+DATA = real_data.DATA / "handeye"
+pytestmark = [pytest.mark.real, real_data.needs(DATA)]
 SETS = {
     "rtde_ur5e": (
         "Hand-Eye-Data/*.jpg",
