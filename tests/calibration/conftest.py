@@ -11,6 +11,7 @@ from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, RobotErrorMap, TagBoard, Target
+from realsim.robots.arm import UR5
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection
@@ -31,6 +32,18 @@ def camera_at(
     # The board's z points into the paper, so the camera stands on its negative side.
     away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
     return se3.invert(se3.look_at(middle + distance * np.array(away), middle, roll))
+
+
+def pose_pairs(
+    seed: int, n: int, turn_sd: float = 0.0, shift_sd: float = 0.0
+) -> tuple[Array, Array, Array, Array]:
+    """Return X, Z and pairs of hand and board poses (n, 4, 4), the hand's with errors [rad, m]."""
+    rng = np.random.default_rng(seed)
+    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng, spread=0.5)
+    places = rng.normal([0.0, 0.0, 0.6], 0.05, (n, 3))
+    C = se3.from_rt(se3.exp_so3(rng.normal(scale=0.5, size=(n, 3))), places)
+    errors = rng.normal(size=(n, 6)) * np.repeat([turn_sd, shift_sd], 3)
+    return X, Z, Z @ se3.invert(C) @ se3.invert(X) @ se3.exp(errors), C
 
 
 class Simulation:
@@ -175,27 +188,16 @@ def record(
 
 # --- calibrations of a simulated arm with errors in its joints and links -------------------------
 
-ARM = DhArm(
-    name="ur5", a=np.array([0, -0.425, -0.39225, 0, 0, 0]),
-    d=np.array([0.089159, 0, 0, 0.10915, 0.09465, 0.0823]),
-    alpha=np.array([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]),
-)  # fmt: skip
+ARM = UR5.bare()
 ARM_START = np.array([0.0, -1.4, 1.9, -2.0, -1.57, 0.0])
 PRINT_SCALE = 0.9958
 HOSTILE_NAME = "<script>alert('$x^2$ & _y_')</script>.png"
 
 
-def joints_of(T: Array, rng: np.random.Generator) -> Array | None:
-    """Return joints (6,) at which the arm's flange is at T, None where none were found."""
-    for _ in range(8):
-        q = ARM_START + rng.normal(scale=0.5, size=6)
-        for _ in range(60):
-            e = se3.log(se3.invert(ARM.forward(q)) @ T)
-            if np.linalg.norm(e) < 1e-9:
-                return q
-            J = ARM.jacobian(q)
-            q = q + J.T @ np.linalg.solve(J @ J.T + 1e-5 * np.eye(6), e)
-    return None
+def joints_of(T: Array) -> Array | None:
+    """Return joints (6,) at which the arm's flange is at T, None where there are none."""
+    found, _ = UR5.inverse_branches(T[None])
+    return min(found, key=lambda q: np.abs(q - ARM_START).max(), default=None)
 
 
 def printed_points(board: TagBoard) -> Array:
@@ -228,7 +230,7 @@ def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> lis
         q, told = None, T_hand
         A = T_hand @ se3.exp(rng.normal(scale=3e-4, size=6))
         if in_hand:
-            q = joints_of(T_hand, rng)
+            q = joints_of(T_hand)
             if q is None:
                 continue
             A = real.forward(q) @ se3.exp(rng.normal(scale=1e-4, size=6))

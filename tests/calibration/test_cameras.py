@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from realsim.arrays import Array
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard, TagBoard
@@ -303,6 +303,19 @@ def other_size(rig: Rig) -> Rig:
     return replace(rig, cameras=(*rig.cameras[:2], replace(rig.cameras[2], intrinsics0=small)))
 
 
+def exchanged_lenses(rig: Rig) -> Rig:
+    wrong = replace(FACTORY, fx=1100.0, fy=1100.0)
+    cameras = (rig.cameras[0], replace(rig.cameras[1], intrinsics0=wrong), rig.cameras[2])
+    # The left images are those of a lens of 1044 px, the right ones are made those of 1100 px.
+    grown = [
+        replace(s, detection=replace(s.detection, uv=(s.detection.uv - 640) * 1.054 + 640))
+        if s.camera == 2 else s
+        for s in rig.sightings
+    ]  # fmt: skip
+    kept = [s for s in grown if s.detection.uv.min() > 0 and np.all(s.detection.uv < [1279, 959])]
+    return replace(rig.only(kept), cameras=cameras)
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -313,6 +326,7 @@ def other_size(rig: Rig) -> Rig:
         (boards_at("hand", "table"), ("boards 'table' and 'held' are exchanged",)),
         (same_boards, ("carry the same markers", "another first id")),
         (lone_camera, ("camera 'right' sees a board in 1 of 1 images", "right.yaml")),
+        (exchanged_lenses, ("'left' and 'right' look exchanged",)),
         (other_size, ("camera 'right'", "640x480", "1280x960", "--intrinsics")),
     ],
 )
@@ -321,21 +335,6 @@ def test_bad_input_is_named_with_what_to_do(
 ) -> None:
     said = refused(".", calibrate_cameras, fault(lab()), PLAIN)
     assert all(word in said for word in words), said
-
-
-def test_intrinsics_of_two_cameras_exchanged() -> None:
-    rig = lab()
-    wrong = replace(FACTORY, fx=1100.0, fy=1100.0)
-    cameras = (rig.cameras[0], replace(rig.cameras[1], intrinsics0=wrong), rig.cameras[2])
-    # The left images are those of a lens of 1044 px, the right ones are made those of 1100 px.
-    grown = [
-        replace(s, detection=replace(s.detection, uv=(s.detection.uv - 640) * 1.054 + 640))
-        if s.camera == 2 else s
-        for s in rig.sightings
-    ]  # fmt: skip
-    kept = [s for s in grown if s.detection.uv.min() > 0 and np.all(s.detection.uv < [1279, 959])]
-    with pytest.raises(InputError, match="'left' and 'right' look exchanged"):
-        calibrate_cameras(replace(rig.only(kept), cameras=cameras), PLAIN)
 
 
 def test_images_of_two_cameras_exchanged_at_one_instant() -> None:
@@ -375,6 +374,5 @@ def test_a_camera_that_nothing_ties_is_named() -> None:
 def test_a_hand_that_does_not_turn_is_refused() -> None:
     rig = lab()
     still = se3.from_translation([0.4, 0.0, 0.4])
-    instants = tuple(replace(t, T_base_ee=still) for t in rig.instants)
-    with pytest.raises((DegenerateError, InputError)):
-        calibrate_cameras(replace(rig, instants=instants), PLAIN)
+    rig = replace(rig, instants=tuple(replace(t, T_base_ee=still) for t in rig.instants))
+    refused("the hand does not turn", calibrate_cameras, rig, PLAIN, error=DegenerateError)

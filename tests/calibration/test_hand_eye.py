@@ -13,6 +13,7 @@ from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.hand_eye import calibrate_hand_eye, calibrate_hand_eye_report
 from realsim_calibration.views import BoardView
 from refusals import refused
+from tests.calibration.conftest import pose_pairs
 
 
 def error_of(hand_eye, sim):
@@ -217,30 +218,20 @@ def test_board_pose_keeps_the_twin_apart(simulate):
 ALL = sorted(CLOSED_FORMS)
 
 
-def problem(seed, n=10, rot=0.0, trans=0.0):
-    rng = np.random.default_rng(seed)
-    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng, spread=0.5)
-    C = se3.from_rt(se3.exp_so3(rng.normal(scale=0.5, size=(n, 3))), rng.normal(size=(n, 3)))
-    C[:, 2, 3] += 1.0
-    A = Z @ se3.invert(C) @ se3.invert(X)
-    noise = np.concatenate([rng.normal(scale=s, size=(n, 3)) for s in (rot, trans)], -1)
-    return A @ se3.exp(noise), C, X, Z
-
-
 def close(a, b, tol=1e-9):
     return np.abs(a - b).max() < tol
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_exact_on_perfect_data(name):
-    A, C, X, Z = problem(0)
+    X, Z, A, C = pose_pairs(0, 10)
     x, z = CLOSED_FORMS[name](A, C)
     assert close(x, X) and close(z, Z)
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_frames_of_base_and_board_do_not_matter(name):
-    A, C, _, _ = problem(1, rot=0.01, trans=0.01)
+    _, _, A, C = pose_pairs(1, 10, 0.01, 0.01)
     rng = np.random.default_rng(9)
     G, H = se3.random_transform(rng), se3.random_transform(rng)
     x, z = CLOSED_FORMS[name](A, C)
@@ -265,6 +256,6 @@ def test_one_axis_is_refused_and_named(name):
 def test_what_cannot_be_solved_is_refused():
     still = se3.from_translation(np.random.default_rng(0).normal(size=(8, 3)))
     refused("does not turn", park, still, still, error=DegenerateError)
-    A, C, _, _ = problem(0)
+    _, _, A, C = pose_pairs(0, 10)
     refused("2 usable views", check_observable, A[:2], error=DegenerateError)
     refused("10 hand poses and 9 board poses", park, A, C[1:])

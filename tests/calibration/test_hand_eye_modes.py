@@ -36,18 +36,9 @@ from realsim_calibration.report.summary import places_rows, viewpoint
 from realsim_calibration.results import Clock
 from realsim_calibration.screening import Screened, screen, stacks
 from refusals import refused
-from tests.calibration.conftest import FACTORY, arm_views
+from tests.calibration.conftest import FACTORY, arm_views, pose_pairs
 
 CLOCK = Clock(offset_s=0.035, sigma_s=0.0004, applied=True)
-
-
-def pose_pairs(n):
-    """Return X, Z and exact pairs of hand and board poses (n, 4, 4)."""
-    rng = np.random.default_rng(0)
-    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng)
-    C = np.array([se3.exp([*rng.normal(scale=0.5, size=3), 0, 0, 0]) for _ in range(n)])
-    C[:, :3, 3] = np.array([0.0, 0.0, 0.6]) + rng.normal(scale=0.05, size=(n, 3))
-    return X, Z, Z @ se3.invert(C) @ se3.invert(X), C
 
 
 def seen_from(sim, T_cam_board, target):
@@ -101,7 +92,7 @@ def test_a_given_camera_of_another_focal_length_is_named_and_not_the_board(simul
 
 
 def test_the_lens_of_pose_pairs_is_the_given_one_or_is_said_to_be_none(tmp_path):
-    X, _, A, C = pose_pairs(9)
+    X, _, A, C = pose_pairs(0, 9)
     lens = CameraIntrinsics(
         width=1280, height=720, fx=910.0, fy=911.0, cx=641.0, cy=357.0, distortion=[0.1, -0.2]
     )
@@ -123,7 +114,7 @@ def test_the_lens_of_pose_pairs_is_the_given_one_or_is_said_to_be_none(tmp_path)
 
 
 def test_perfect_poses_alone_give_the_truth():
-    X, Z, A, C = pose_pairs(12)
+    X, Z, A, C = pose_pairs(0, 12)
     r = calibrate_from_poses(A, C)
     assert np.abs(se3.log(se3.invert(X) @ r.X)).max() < 1e-6
     assert np.abs(se3.log(se3.invert(Z) @ r.Z)).max() < 1e-6
