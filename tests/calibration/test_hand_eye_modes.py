@@ -17,7 +17,6 @@ from realsim_calibration import (
     BoardView,
     HandEyeConfig,
     HandEyeReport,
-    TargetDetection,
     calibrate,
     calibrate_from_poses,
     calibrate_hand_eye_report,
@@ -35,17 +34,11 @@ from realsim_calibration.hand_eye import choose_plain, setup_of
 from realsim_calibration.report.summary import places_rows, viewpoint
 from realsim_calibration.results import Clock
 from realsim_calibration.screening import Screened, screen, stacks
+from realsim_calibration.views import detection_of
 from refusals import refused
 from tests.calibration.conftest import FACTORY, arm_views, pose_pairs
 
 CLOCK = Clock(offset_s=0.035, sigma_s=0.0004, applied=True)
-
-
-def seen_from(sim, T_cam_board, target):
-    uv = project(sim.intrinsics, se3.transform(T_cam_board, target.points_board))
-    size = (sim.intrinsics.width, sim.intrinsics.height)
-    inside = np.all((uv > 0) & (uv < np.array(size) - 1), axis=1)
-    return TargetDetection(point_ids=np.flatnonzero(inside), uv=uv[inside], image_size=size)
 
 
 def test_a_camera_that_stands_still_is_placed_in_the_base(simulate):
@@ -68,7 +61,10 @@ def test_boards_counted_from_the_wrong_end_are_mended(simulate):
     views = []
     for v, ee in zip(sim.views, sim.truth_ee, strict=True):
         T = se3.invert(ee @ sim.T_ee_cam) @ sim.T_base_board
-        views.append(replace(v, detection=seen_from(sim, T, target)))
+        uv = project(sim.intrinsics, se3.transform(T, target.points_board))
+        inside = np.flatnonzero(np.all((uv > 0) & (uv < [1279, 719]), axis=1))
+        seen = detection_of(target, uv[inside], (1280, 720), inside)
+        views.append(replace(v, detection=seen))
     plain = calibrate_hand_eye_report(views, target, sim.intrinsics0)
     flipped = list(views)
     for k in (2, 5, 9):
