@@ -31,6 +31,11 @@ READY = PANDA.arm.home
 ARMS = ("panda", "ur5", "ur5e", "iiwa14", "xarm6")
 
 
+@pytest.fixture
+def arm(name):
+    return GraspingArm(find_arm(name), HAND)
+
+
 def random_turns(n, seed=0, arm=PANDA):
     low, high = np.maximum(arm.limits.lower, -np.pi), np.minimum(arm.limits.upper, np.pi)
     return np.random.default_rng(seed).uniform(low, high, (n, arm.joints))
@@ -100,8 +105,7 @@ def test_the_surface_of_every_link_is_inside_its_spheres_which_are_few_and_close
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_levers_bound_how_far_a_sphere_is_from_each_axis(name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_levers_bound_how_far_a_sphere_is_from_each_axis(arm):
     body = space_of(arm=arm).bodies[True]
     q = random_turns(300, arm=arm)
     frames, centers = placed(arm, body, q, 0.05)
@@ -114,8 +118,7 @@ def test_levers_bound_how_far_a_sphere_is_from_each_axis(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_what_is_called_free_of_itself_never_penetrates_by_coal(name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_what_is_called_free_of_itself_never_penetrates_by_coal(arm):
     q = random_turns(500, arm=arm)
     space = space_of(T_table_base=upright(5.0), arm=arm)
     free = space.blame(q, np.full(len(q), 0.05), with_hand=False) == FREE
@@ -199,8 +202,7 @@ def test_the_ready_pose_is_franka_s():
 
 
 @pytest.mark.parametrize("name", FOUR_ARMS)
-def test_inverse_solutions_reach_the_pose_within_the_limits(name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_inverse_solutions_reach_the_pose_within_the_limits(arm):
     Ts = arm.forward(random_turns(20, arm=arm))
     owner, q = arm.inverse(Ts, 16, 0.01, arm.arm.home)
     assert np.all(np.diff(owner) >= 0) and len(set(owner.tolist())) >= 17
@@ -209,8 +211,7 @@ def test_inverse_solutions_reach_the_pose_within_the_limits(name):
 
 
 @pytest.mark.parametrize("name", FOUR_ARMS)
-def test_the_swinging_joint_s_axis_in_the_grasp_frame_stays_when_it_turns(name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_the_swinging_joint_s_axis_in_the_grasp_frame_stays_when_it_turns(arm):
     q, j = random_turns(5, arm=arm), arm.swing_joint
     axis, point, left = arm.swing_in_grasp(q)
     T, turned = arm.forward(q), arm.forward(q + 0.3 * np.eye(arm.joints)[j])
@@ -221,8 +222,7 @@ def test_the_swinging_joint_s_axis_in_the_grasp_frame_stays_when_it_turns(name):
 
 
 @pytest.mark.parametrize("name", FOUR_ARMS)
-def test_the_wrist_s_distance_is_within_its_bounds_wherever_the_arm_is(name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_the_wrist_s_distance_is_within_its_bounds_wherever_the_arm_is(arm, name):
     q = random_turns(3000, seed=1, arm=arm)
     least = arm.wrist_distance(arm.forward(q))
     assert np.all(least <= arm.wrist_reach_m + 1e-9) and least.max() > 0.95 * arm.wrist_reach_m
@@ -249,8 +249,7 @@ def test_followed_lines_are_straight_and_their_slopes_are_derivatives():
 
 
 @pytest.mark.parametrize("name", FOUR_ARMS)
-def test_pybullet_has_the_same_forward_kinematics(tmp_path, name):
-    arm = GraspingArm(find_arm(name), HAND)
+def test_pybullet_has_the_same_forward_kinematics(tmp_path, arm):
     path, n = tmp_path / "arm.urdf", arm.joints
     links = (PANDA_LINKS[1],) * (n + 1)
     path.write_text(arm_urdf(arm.arm, HAND, hand_urdf(HAND, PadModel()), links), encoding="utf-8")

@@ -58,14 +58,11 @@ def trial():
     return bar_trial(np.array([0.0, 0.02, 0.04, 0.05, 0.058, 0.065, 0.08, 0.12]))
 
 
-@pytest.fixture(scope="module")
-def loads(trial):
-    return stage_loads(trial, SlipMotion())
-
-
-def draws_of(grasped, trial, config=None, stiffness_n_per_m=2e5, hand=HAND, force_n=FORCE):
+def draws_of(
+    grasped, trial, config=None, stiffness_n_per_m=2e5, hand=HAND, force_n=FORCE, covariance=None
+):
     loads = stage_loads(trial, SlipMotion())
-    return draw_holds(grasped, trial, loads, hand, force_n, None, config, stiffness_n_per_m)
+    return draw_holds(grasped, trial, loads, hand, force_n, covariance, config, stiffness_n_per_m)
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +170,8 @@ def test_numbers_that_cannot_be_are_named(numbers, told):
         (np.diag([1.0, 1, 1, 1, 1, -1]) * 1e-6, "negative variance"),
     ],
 )
-def test_a_covariance_that_is_none_is_named(bar, trial, loads, covariance, told):
-    refused(told, draw_holds, bar, trial, loads, HAND, FORCE, covariance)
+def test_a_covariance_that_is_none_is_named(bar, trial, covariance, told):
+    refused(told, draws_of, bar, trial, covariance=covariance)
 
 
 def test_a_covariance_moves_the_object_as_it_says():

@@ -4,7 +4,6 @@ The School's summary: its rows sum exactly, and they are the paper's rows.
 """
 
 import json
-import math
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -29,6 +28,8 @@ from realsim_sim_bridge.slip.score import ScoreLimits, limits_of, score_paper, s
 from refusals import refused
 from school_scenes import CONFIG, at, model, scene
 from tried_grasps import assert_same, plain_grasps
+
+NAN, INF, TEN = np.nan, np.inf, np.radians(10.0)
 
 
 @pytest.fixture(scope="module")
@@ -192,10 +193,9 @@ def by_hand(rows):
 
 
 def test_each_outcome_is_told_by_base_and_score():
-    nan = math.nan
     s = by_hand(
         [
-            (False, nan, nan, 0), (False, 0.0, 0.0, 0), (True, 0.0, 0.0, 1), (True, 0.25, 0.0, 2),
+            (False, NAN, NAN, 0), (False, 0.0, 0.0, 0), (True, 0.0, 0.0, 1), (True, 0.25, 0.0, 2),
             (True, 0.25, 0.25, 2), (True, 0.5, 0.5 - 1 / 12, 3), (True, 1.0, 0.25, 4),
             (True, 0.5, 0.5, 3), (True, 0.75, 0.75 - 2 / 12, 4), (True, 1.0, 1.0, 4),
             (False, 0.75, 0.75, 4),
@@ -215,7 +215,7 @@ def test_each_outcome_is_told_by_base_and_score():
 
 def test_impossible_scores_are_named():
     refused("at most its base score", outcomes_of, by_hand([(True, 0.5, 0.75, 3)]))
-    refused("both are known or neither", outcomes_of, by_hand([(True, math.nan, 0.75, 3)]))
+    refused("both are known or neither", outcomes_of, by_hand([(True, NAN, 0.75, 3)]))
     refused("a base score", outcomes_of, by_hand([(True, 0.6, 0.5, 3)]))
 
 
@@ -340,9 +340,6 @@ def test_hands_are_compared_on_the_objects_that_all_of_them_tried():
 
 
 # --- The score: the paper's formula, and that it follows from what is stored alone.
-
-NAN, INF = np.nan, np.inf
-TEN = np.radians(10.0)
 
 
 def one(slip_m, slip_rad, tried=True):

@@ -185,8 +185,7 @@ MIRRORED = {"left": [0, 1], "right": [0, -1], "front": [-1, 0], "behind": [1, 0]
 
 
 def box(x: float, y: float, half: float, height: float = 0.1) -> np.ndarray:
-    corners = [[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)]
-    return np.array(corners) * [half, half, height] + [x, y, 0.0]
+    return trimesh_solids.box((2 * half, 2 * half, height), (x, y, height / 2)).vertices
 
 
 def standing(turn: float = 0.0, gap: float = 0.02) -> placing.Standing:

@@ -58,8 +58,8 @@ def _layout() -> Layout:
 
 
 @cache
-def _built() -> BuiltScene:
-    return build_scene(_layout(), _pool(), CONFIG)
+def _built(own: OwnLooks = OwnLooks()) -> BuiltScene:  # noqa: B008 - frozen, and no argument of a user
+    return build_scene(_layout(), _pool(), CONFIG, own=own)
 
 
 def test_the_same_seed_gives_the_same_scene_whatever_was_made_before() -> None:
@@ -171,17 +171,6 @@ def test_a_pool_of_which_nothing_can_be_used_is_refused_with_the_reasons(tmp_pat
 # --- Cameras of generated scenes, how these look, and the models that the school takes.
 
 CUBE = [corners((-0.05, -0.05, 0.0), (0.05, 0.05, 0.1))]
-SCENE = TableSceneConfig(objects=(2, 2))
-
-
-@cache
-def _small_layout() -> Layout:
-    return sample_layout(1, 0, _pool(), SCENE)
-
-
-@cache
-def _small_built(own: OwnLooks = OwnLooks()) -> BuiltScene:  # noqa: B008 - frozen, and no argument of a user
-    return build_scene(_small_layout(), _pool(), SCENE, own=own)
 
 
 # --- cameras ----------------------------------------------------------------------------------
@@ -245,25 +234,25 @@ def _bytes(material: Material) -> list[bytes]:
 
 
 def test_the_same_seed_gives_the_same_looks_to_the_byte() -> None:
-    a = _small_built().synthetic
-    b = build_scene(_small_layout(), open_pool(["pybullet"]), SCENE).synthetic
+    a = _built().synthetic
+    b = build_scene(_layout(), open_pool(["pybullet"]), CONFIG).synthetic
     assert a.digests() == b.digests()
     assert [_bytes(m) for m in a.materials.values()] == [_bytes(m) for m in b.materials.values()]
-    assert set(a.materials) == {0, 1}
+    assert set(a.materials) == set(range(len(_layout().objects)))
 
 
 def test_no_object_gets_the_name_of_another_file() -> None:
-    layout = _small_layout()
+    layout = _layout()
     names = ("mug", "mug", "mug-no2")
     called = tuple(replace(layout.objects[0], name=name) for name in names)
-    scene = build_scene(replace(layout, objects=called), open_pool(["pybullet"]), SCENE).synthetic
+    scene = build_scene(replace(layout, objects=called), open_pool(["pybullet"]), CONFIG).synthetic
     assert [m.name for m in scene.models.values()] == ["mug", "mug-no3", "mug-no2"]
 
 
 def test_the_users_own_pictures_cover_table_floor_and_objects(tmp_path: Path) -> None:
     for k, color in enumerate(((0, 0, 255), (0, 255, 0))):
         cv2.imwrite(str(tmp_path / f"paint{k}.png"), np.full((16, 16, 3), color, np.uint8))
-    built = _small_built(own_looks(None, tmp_path)).synthetic
+    built = _built(own_looks(None, tmp_path)).synthetic
     looks = {p.material.name for p in built.surroundings if p.material is not None}
     assert looks & {"paint0", "paint1"}
     assert {m.name for m in built.materials.values()} <= {"paint0", "paint1"}
@@ -278,9 +267,9 @@ def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_school_knows_the_parts_and_the_matter_that_were_dropped(tmp_path: Path) -> None:
-    built = _small_built()
+    built = _built()
     write_models(tmp_path, built)
-    solids, unknown = known_solids(tmp_path, [1, 2])
+    solids, unknown = known_solids(tmp_path, sorted(built.solids))
     assert not unknown
     for obj_id, solid in built.solids.items():
         kept = solids[obj_id]
