@@ -6,52 +6,71 @@ import numpy as np
 import pytest
 import trimesh
 
-import trimesh_solids as solids
-from plain_meshes import ball, box
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.pixel_caster import PixelCaster, body_of
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.rays import RayScene, rotated
 from refusals import refused
+from trimesh_solids import ball, box, solid
 
-LENS = np.array([-0.08, 0.06, 0.0008, -0.0011, -0.02])
-CAMERA = CameraIntrinsics(width=320, height=180, fx=163.0, fy=161.0, cx=158.7, cy=91.2,
-                          distortion=LENS)  # fmt: skip
+SIZE = (320, 240)
+LENSES = {
+    "none": np.zeros(5),
+    "d405": np.array([-0.055, 0.062, 0.0005, -0.0007, -0.02]),
+    "barrel": np.array([-0.3, 0.12, 0.0, 0.0, 0.0]),
+    "pincushion": np.array([0.25, 0.1, 0.001, -0.002, 0.0]),
+    "rational": np.array([0.9, 0.3, 5e-4, -3e-4, 0.02, 1.2, 0.5, 0.03]),
+    "tangential": np.array([-0.1, 0.05, 0.01, -0.008, 0.0]),
+}
+
+MESHES = {
+    "ball": ball(),
+    "ring": solid(trimesh.creation.torus(0.05, 0.02)),
+    "box": box((0.09, 0.05, 0.07)),
+}
 
 
-def table() -> PlacedMesh:
-    return PlacedMesh(-1, box((1.2, 1.0, 0.02)), se3.from_translation([0.4, 0, -0.01]))
+def a_camera(name: str, f: float = 210.0) -> CameraIntrinsics:
+    K = np.array([[f, 0, SIZE[0] / 2 - 0.7], [0, f * 1.01, SIZE[1] / 2 + 0.4], [0, 0, 1]])
+    return CameraIntrinsics.from_K(K, *SIZE, LENSES[name])
 
 
-def clutter(seed: int = 0, n: int = 6) -> list[PlacedMesh]:
+def a_scene(seed: int) -> list[PlacedMesh]:
     rng = np.random.default_rng(seed)
-    placed = [table()]
-    for i in range(n):
-        R = se3.exp_so3([0, 0, rng.uniform(0, 6)])
-        T = se3.from_rt(R, [0.4 + rng.uniform(-0.12, 0.12), rng.uniform(-0.12, 0.12), 0.04])
-        placed.append(PlacedMesh(3 * i, ball(0.04) if i % 2 else box((0.06, 0.04, 0.08)), T))
+    placed = [PlacedMesh(-1, box((1.08, 1, 0.021)), se3.from_translation([0, 0, -0.0105]))]
+    for i, kind in enumerate(("ball", "ring", "box", "ring", "ball", "box")):
+        at = [*rng.uniform(-0.12, 0.12, 2), 0.04]
+        T = se3.from_rt(se3.exp_so3(rng.normal(size=3)), at)
+        placed.append(PlacedMesh(2 * i, MESHES[kind], T))
     return placed
 
 
-def view() -> np.ndarray:
-    return se3.look_at([0.15, -0.3, 0.3], [0.4, 0.0, 0.03])
+def views(n: int, seed: int = 3) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    eyes = rng.normal(size=(n, 3)) * [1, 1, 0.4]
+    eyes[:, 2] = np.abs(eyes[:, 2]) + 0.3
+    eyes *= 0.42 / np.linalg.norm(eyes, axis=1, keepdims=True)
+    return [se3.look_at(eye, rng.uniform(-0.03, 0.03, 3)) for eye in eyes]
 
 
-@pytest.mark.parametrize("distortion", [np.zeros(5), LENS, [0.9, 0.3, 5e-4, -3e-4, 0.02, 1.2, 0.5]])
+CAMERA, VIEW = a_camera("d405"), views(1)[0]
+
+
+@pytest.mark.parametrize("distortion", [LENSES["none"], LENSES["d405"], LENSES["rational"][:7]])
 def test_hits_project_onto_their_own_pixel(distortion: np.ndarray) -> None:
     import cv2
 
-    i = CameraIntrinsics.from_K(CAMERA.K, 320, 180, distortion)
-    labels = LabelRenderer(clutter()).render(i, view())
+    i = CameraIntrinsics.from_K(CAMERA.K, *SIZE, distortion)
+    labels = LabelRenderer(a_scene(1)).render(i, VIEW)
     v, u = np.nonzero(labels.depth_m > 0)
-    assert len(v) > 0.5 * 320 * 180
+    assert len(v) > 0.5 * 320 * 240
     xy, _ = camera.undistort(i, np.stack([u, v], -1))
     points = np.concatenate([xy, np.ones((len(u), 1))], -1) * labels.depth_m[v, u, None]
     # The points lie on the meshes: on the table top, or on or in the height of the objects.
-    world = se3.transform(view(), points)
+    world = se3.transform(VIEW, points)
     on_table = labels.ids[v, u] < 0
-    assert np.abs(world[on_table & (np.abs(world[:, 0] - 0.4) < 0.5), 2]).max() < 1e-5
+    assert np.abs(world[on_table & (np.abs(world[:, 0]) < 0.5), 2]).max() < 1e-5
     uv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), i.K, i.distortion)[0][:, 0]
     assert np.abs(uv - np.stack([u, v], -1)).max() < 1e-3
 
@@ -75,23 +94,23 @@ def test_box_over_a_plane_covers_the_pixels_of_its_projection() -> None:
 
 
 def test_amodal_is_the_render_of_the_object_alone() -> None:
-    placed = clutter(n=8)
-    labels = LabelRenderer(placed).render(CAMERA, view())
+    placed = a_scene(1)
+    labels = LabelRenderer(placed).render(CAMERA, VIEW)
     assert min(labels.visible_fraction.values()) < 0.8  # there is something to complete
     for p in placed[1:]:
-        alone = LabelRenderer([p]).render(CAMERA, view())
+        alone = LabelRenderer([p]).render(CAMERA, VIEW)
         assert np.array_equal(labels.amodal[p.instance], alone.ids == p.instance)
         assert not np.any(labels.visible(p.instance) & ~labels.amodal[p.instance])
         assert labels.px_count_all[p.instance] == int(labels.amodal[p.instance].sum())
 
 
 def test_count_beyond_the_border_does_not_depend_on_the_crop() -> None:
-    placed = clutter()
-    whole = LabelRenderer(placed).render(CAMERA, view())
+    placed = a_scene(1)
+    whole = LabelRenderer(placed).render(CAMERA, VIEW)
     for x, y, width, height in ((100, 60, 120, 70), (140, 20, 110, 90)):
         at = (CAMERA.cx - x, CAMERA.cy - y)
         cropped = replace(CAMERA, width=width, height=height, cx=at[0], cy=at[1])
-        part = LabelRenderer(placed).render(cropped, view())
+        part = LabelRenderer(placed).render(cropped, VIEW)
         assert part.px_count_all == whole.px_count_all
         assert np.array_equal(part.ids, whole.ids[y : y + height, x : x + width])
         for p in placed[1:]:
@@ -101,11 +120,11 @@ def test_count_beyond_the_border_does_not_depend_on_the_crop() -> None:
 
 
 def test_moving_world_and_camera_together_changes_nothing() -> None:
-    placed = clutter()
-    before = LabelRenderer(placed).render(CAMERA, view())
+    placed = a_scene(1)
+    before = LabelRenderer(placed).render(CAMERA, VIEW)
     M = se3.random_transform(np.random.default_rng(4), spread=5.0)
     moved = [PlacedMesh(p.instance, p.mesh, M @ p.T_world_obj) for p in placed]
-    after = LabelRenderer(moved).render(CAMERA, M @ view())
+    after = LabelRenderer(moved).render(CAMERA, M @ VIEW)
     # Float32 may round a ray that grazes a silhouette the other way.
     same = before.ids == after.ids
     assert np.count_nonzero(~same) <= 3
@@ -146,65 +165,26 @@ def test_pixels_without_a_ray_are_background() -> None:
 
 
 def test_cast_rays_names_the_face_and_the_point() -> None:
-    renderer = LabelRenderer(clutter())
-    rays = np.array([[0.9, 0.4, 1, 0, 0, -1], [0.9, 0.4, 1, 0, 0, 1]], np.float32)
-    hits = renderer.cast_rays(rays)
+    scene = a_scene(1)
+    rays = np.array([[0.5, 0.4, 1, 0, 0, -1], [0.5, 0.4, 1, 0, 0, 1]], np.float32)
+    hits = LabelRenderer(scene).cast_rays(rays)
     assert hits.geometry.tolist() == [0, -1]
     assert hits.instance.tolist() == [-1, -1]
     assert hits.t[0] == pytest.approx(1.0, abs=1e-6) and np.isinf(hits.t[1])
-    a, b, c = table().mesh.vertices[table().mesh.faces[hits.face[0]]] + [0.4, 0, -0.01]
+    table = scene[0].mesh
+    a, b, c = table.vertices[table.faces[hits.face[0]]] + scene[0].T_world_obj[:3, 3]
     u, v = hits.uv[0]
-    assert np.allclose(a + u * (b - a) + v * (c - a), [0.9, 0.4, 0], atol=1e-6)
+    assert np.allclose(a + u * (b - a) + v * (c - a), [0.5, 0.4, 0], atol=1e-6)
     assert np.allclose(hits.normal[0], [0, 0, 1], atol=1e-6)
 
 
 def test_mistakes_are_named() -> None:
     refused("share an instance", LabelRenderer, [PlacedMesh(1, ball(0.1), np.eye(4))] * 2)
-    refused("they have: 0, 3", LabelRenderer(clutter(n=2)).render(CAMERA, view()).visible, 1)
+    refused("they have: 0, 2, 4", LabelRenderer(a_scene(1)).render(CAMERA, VIEW).visible, 1)
     refused("from 0", PlacedMesh, -2, ball(0.1), np.eye(4))
 
 
 # --- the same hits as an independent ray caster, through any lens --------------------------------
-
-
-SIZE = (320, 240)
-LENSES = {
-    "none": np.zeros(5),
-    "d405": np.array([-0.055, 0.062, 0.0005, -0.0007, -0.02]),
-    "barrel": np.array([-0.3, 0.12, 0.0, 0.0, 0.0]),
-    "pincushion": np.array([0.25, 0.1, 0.001, -0.002, 0.0]),
-    "rational": np.array([0.9, 0.3, 5e-4, -3e-4, 0.02, 1.2, 0.5, 0.03]),
-    "tangential": np.array([-0.1, 0.05, 0.01, -0.008, 0.0]),
-}
-
-MESHES = {
-    "ball": solids.ball(),
-    "ring": solids.solid(trimesh.creation.torus(0.05, 0.02)),
-    "box": solids.box((0.09, 0.05, 0.07)),
-}
-
-
-def a_camera(name: str, f: float = 210.0) -> CameraIntrinsics:
-    K = np.array([[f, 0, SIZE[0] / 2 - 0.7], [0, f * 1.01, SIZE[1] / 2 + 0.4], [0, 0, 1]])
-    return CameraIntrinsics.from_K(K, *SIZE, LENSES[name])
-
-
-def a_scene(seed: int) -> list[PlacedMesh]:
-    rng = np.random.default_rng(seed)
-    placed = [PlacedMesh(-1, solids.box((1.08, 1, 0.021)), se3.from_translation([0, 0, -0.0105]))]
-    for i, kind in enumerate(("ball", "ring", "box", "ring", "ball", "box")):
-        at = [*rng.uniform(-0.12, 0.12, 2), 0.04]
-        T = se3.from_rt(se3.exp_so3(rng.normal(size=3)), at)
-        placed.append(PlacedMesh(i, MESHES[kind], T))
-    return placed
-
-
-def views(n: int, seed: int = 3) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    eyes = rng.normal(size=(n, 3)) * [1, 1, 0.4]
-    eyes[:, 2] = np.abs(eyes[:, 2]) + 0.3
-    eyes *= 0.42 / np.linalg.norm(eyes, axis=1, keepdims=True)
-    return [se3.look_at(eye, rng.uniform(-0.03, 0.03, 3)) for eye in eyes]
 
 
 def embree(placed: list[PlacedMesh], lens: CameraIntrinsics, T: np.ndarray):
@@ -239,7 +219,7 @@ def test_a_lens_that_folds_back_shows_nothing_twice() -> None:
     folding = CameraIntrinsics.from_K(K, *SIZE, np.array([-0.3, 0.02, 0.0, 0.0, 0.0]))
     radius = camera.turning_radius(folding)
     assert 1.0 < radius < 2.0
-    labels = LabelRenderer(a_scene(3)).render(folding, views(1)[0])
+    labels = LabelRenderer(a_scene(3)).render(folding, VIEW)
     assert 0.02 < labels.unknown.mean() < 0.9
     assert not np.any(labels.ids[labels.unknown] >= 0) and not labels.depth_m[labels.unknown].any()
     known = camera.ray_table(folding)[~labels.unknown].astype(np.float64)
@@ -266,11 +246,10 @@ def test_a_large_triangle_bends_with_the_lens() -> None:
 
 def test_object_coordinates_lie_on_the_object_and_come_back_to_the_camera() -> None:
     placed = a_scene(4)
-    T = views(1)[0]
-    labels = LabelRenderer(placed).render(a_camera("d405"), T)
+    labels = LabelRenderer(placed).render(CAMERA, VIEW)
     coordinates = labels.object_coordinates()
     assert not coordinates[labels.ids < 0].any()
-    rays = camera.ray_table(a_camera("d405")).astype(np.float64)
+    rays = camera.ray_table(CAMERA).astype(np.float64)
     for p in placed[1:]:
         mine = labels.ids == p.instance
         low, high = p.mesh.bounds
@@ -278,16 +257,15 @@ def test_object_coordinates_lie_on_the_object_and_come_back_to_the_camera() -> N
             continue
         on = coordinates[mine].astype(np.float64)
         assert np.all(on > low - 1e-6) and np.all(on < high + 1e-6)
-        back = se3.transform(se3.invert(T) @ p.T_world_obj, on)
+        back = se3.transform(se3.invert(VIEW) @ p.T_world_obj, on)
         assert np.abs(back - rays[mine] * labels.depth_m[mine, None]).max() < 1e-6
 
 
 def test_normals_are_those_of_the_faces_and_look_at_the_camera() -> None:
     alone = PlacedMesh(0, MESHES["ball"], se3.from_translation([0, 0, 0.3]))
-    lens = a_camera("d405")
-    labels = LabelRenderer([alone]).render(lens, np.eye(4))
+    labels = LabelRenderer([alone]).render(CAMERA, np.eye(4))
     normals = labels.normals()
-    rays = camera.ray_table(lens)
+    rays = camera.ray_table(CAMERA)
     seen = labels.ids == 0
     assert not normals[~seen].any()
     n = normals[seen].astype(np.float64)
@@ -306,8 +284,7 @@ def test_turning_a_face_round_changes_no_label() -> None:
         for p in placed
     ]
     assert body_of(placed[1].mesh).is_solid and not body_of(turned[1].mesh).is_solid
-    T = views(1)[0]
-    a, b = (LabelRenderer(s).render(a_camera("d405"), T) for s in (placed, turned))
+    a, b = (LabelRenderer(s).render(CAMERA, VIEW) for s in (placed, turned))
     assert np.array_equal(a.ids, b.ids) and np.array_equal(a.depth_m, b.depth_m)
     assert a.px_count_all == b.px_count_all
     assert np.array_equal(a.normals(), b.normals())
@@ -326,13 +303,11 @@ def test_a_mesh_with_a_hole_is_seen_from_within() -> None:
 
 def test_a_camera_inside_an_object_is_said() -> None:
     scene = a_scene(6)
-    room = PlacedMesh(9, solids.box((5.4, 3, 4.2)), np.eye(4))
-    T = views(1)[0]
-    lens = a_camera("d405")
-    assert LabelRenderer(scene).render(lens, T).camera_inside == ()
-    labels = LabelRenderer([*scene, room]).render(lens, T)
+    room = PlacedMesh(9, box((5.4, 3, 4.2)), np.eye(4))
+    assert LabelRenderer(scene).render(CAMERA, VIEW).camera_inside == ()
+    labels = LabelRenderer([*scene, room]).render(CAMERA, VIEW)
     assert labels.camera_inside == (9,)
     assert labels.amodal[9].all()  # its inner walls fill the picture
     # Inside its box but outside its body is not inside.
-    hole = PlacedMesh(3, MESHES["ring"], T @ se3.from_translation([0, 0, 0.0]))
-    assert LabelRenderer([hole]).render(lens, T).camera_inside == ()
+    hole = PlacedMesh(3, MESHES["ring"], VIEW)
+    assert LabelRenderer([hole]).render(CAMERA, VIEW).camera_inside == ()

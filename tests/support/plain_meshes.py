@@ -1,4 +1,4 @@
-"""Boxes, squares and balls of a few triangles, and a wedge with a texture."""
+"""Boxes and squares of a few triangles, and a wedge with a texture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,19 +22,6 @@ def square(half: float = 0.5) -> Mesh:
     ring = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     vertices, faces = half * (2 * ring - [1, 1, 0]), np.array([[0, 1, 2], [0, 2, 3]])
     return Mesh(vertices=vertices, faces=faces, uv=ring[:, :2])
-
-
-def ball(radius: float, rings: int = 16) -> Mesh:
-    """A ball round the origin, open at its poles."""
-    polar = np.linspace(0.02, np.pi - 0.02, rings)
-    p, a = np.meshgrid(polar, np.arange(2 * rings) * np.pi / rings, indexing="ij")
-    xyz = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1).reshape(-1, 3)
-    m = 2 * rings
-    i, j = np.divmod(np.arange((rings - 1) * m), m)
-    k = i * m + (j + 1) % m
-    q = i * m + j
-    faces = np.concatenate([np.stack([q, q + m, k + m], -1), np.stack([q, k + m, k], -1)])
-    return Mesh(vertices=radius * xyz, faces=faces)
 
 
 def textured_wedge() -> Mesh:

@@ -8,20 +8,16 @@ import trimesh
 from realsim.records import Mesh
 
 
-def solid(shape: trimesh.Trimesh, **look: Any) -> Mesh:
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces), **look)
+def solid(shape: trimesh.Trimesh, at=(0.0, 0.0, 0.0), **look: Any) -> Mesh:
+    return Mesh(vertices=shape.vertices + np.array(at), faces=np.array(shape.faces), **look)
 
 
 def box(size=(0.1, 0.06, 0.04), at=(0.0, 0.0, 0.0)) -> Mesh:
-    return moved(trimesh.creation.box(size), at)
+    return solid(trimesh.creation.box(size), at)
 
 
 def ball(radius=0.05, subdivisions=4, at=(0.0, 0.0, 0.0)) -> Mesh:
-    return moved(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius), at)
-
-
-def moved(shape: trimesh.Trimesh, at) -> Mesh:
-    return Mesh(vertices=np.array(shape.vertices) + np.array(at), faces=np.array(shape.faces))
+    return solid(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius), at)
 
 
 def wedge(half_angle: float, length: float = 0.04, thin: float = 0.008, half_height: float = 0.03):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from llvm_library import NEEDS_LLVM
-from plain_meshes import ball, box, square
+from plain_meshes import box, square
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
@@ -12,6 +12,7 @@ from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.photo import developed
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer
 from realsim.rendering.rays import PlacedMesh
+from trimesh_solids import ball
 
 LENSES = {
     "brown": np.array([-0.28, 0.11, 0.0012, -0.0009, -0.02, 0, 0, 0]),
@@ -74,7 +75,7 @@ def test_the_path_tracer_meets_what_the_labels_say(
 def test_the_picture_s_edges_lie_on_the_labels_edges() -> None:
     intrinsics = lens("rational", 80, 45)
     dark = Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)
-    placed = [PlacedMesh(0, ball(0.08, 32), np.eye(4), dark)]
+    placed = [PlacedMesh(0, ball(0.08), np.eye(4), dark)]
     T = se3.look_at([0.02, -0.2, 0.15], [0.01, 0.0, 0.0])
     # Against a white sky a black ball darkens a pixel by the share of it that it covers.
     sky = Environment(panorama=np.full((8, 16, 3), 0.5, np.float32))
