@@ -26,19 +26,7 @@ from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
 from realsim.store import SessionStore
 from refusals import refused
-from reviewed_boxes import CAMERAS, boxes_session, grasp_set
-
-CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
-    return boxes_session(tmp_path_factory.mktemp("content") / "boxes")
-
-
-@pytest.fixture(scope="module")
-def shown(store: SessionStore) -> SceneContent:
-    return SceneContent.load(store, CONFIG)
+from reviewed_boxes import CAMERAS, CONFIG, boxes_session, grasp_set
 
 
 def measured(store: SessionStore, region: Region) -> np.ndarray:

@@ -1,6 +1,5 @@
 """The replay of a grasp: its record, the approach made from the grasp, the player, the words."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -92,13 +91,6 @@ class Given:
 
     def motion(self, instance: int, row: int) -> GraspMotion | None:
         return None if row == 9 else replace(self.given, instance=instance, row=row)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
 
 
 def player_of(server: viser.ViserServer, motions: Motions, **kwargs: object) -> ReplayPlayer:

@@ -23,15 +23,9 @@ from realsim.review import ReviewServer
 from realsim.store import SessionStore
 from refusals import refused
 from review_browser import CAMERA, SOCKET, serving
-from reviewed_boxes import boxes_session
 from waiting import comes_about
 
 TOKEN = "a-secret-of-more-than-16"
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
-    return boxes_session(tmp_path_factory.mktemp("review") / "boxes")
 
 
 @pytest.fixture(scope="module")

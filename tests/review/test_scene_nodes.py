@@ -3,7 +3,6 @@
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,36 +11,19 @@ import pytest
 import viser
 
 from realsim.geometry import se3
-from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.drawing.scene_nodes import GraspFilter, SceneNodes
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from refusals import refused
-from reviewed_boxes import CAMERAS, SCENE, boxes_session
+from reviewed_boxes import CAMERAS, CONFIG, SCENE
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 from review_client import Browser
 
-CONFIG = SceneConfig(
-    voxel_m=0.004, coarse_points=200, piece_points=700, shown_points=1000, thumbnail_px=40
-)
-
 
 def opened(server: viser.ViserServer) -> Browser:
     return Browser.open(f"http://127.0.0.1:{server.get_port()}")
-
-
-@pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> SceneContent:
-    return SceneContent.load(boxes_session(tmp_path_factory.mktemp("nodes") / "boxes"), CONFIG)
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    made = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield made
-    made.stop()
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, 
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.review.content.config import SceneConfig
 from realsim.store import SessionStore, save_grasps, save_scene
 from tried_grasps import plain_grasps
 
@@ -23,6 +24,9 @@ INTRINSICS = CameraIntrinsics(
 )  # fmt: skip
 DEPTH_UNIT_M = 1e-4
 RED = (180, 60, 40)
+CONFIG = SceneConfig(
+    voxel_m=0.004, coarse_points=200, piece_points=700, shown_points=1000, thumbnail_px=40
+)
 CAMERAS = [
     se3.look_at([0.5 + 0.4 * np.cos(a), 0.4 * np.sin(a), 0.3], [0.5, 0.0, 0.03])
     for a in (0.0, 1.6, 3.1, 4.7)
