@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pose_layouts import LAYOUTS, PAIRS, folder_a_pose, layouts_read, save_images, tiny
-from pose_rows import rows_of
+from pose_rows import rows_of, write_lines
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
@@ -22,10 +22,6 @@ from refusals import refused
 READING = reading_from_text("quat_xyzw,m")
 
 
-def pixels(seed, size=(24, 32)):
-    return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
-
-
 def save(path, array):
     Image.fromarray(array).save(path)
     return path
@@ -34,20 +30,12 @@ def save(path, array):
 def make_images(folder, names):
     folder.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
-        save(folder / name, pixels(k))
+        save(folder / name, tiny(k))
     return folder
 
 
 def rows(n, seed=0):
     return rows_of(READING, se3.random_transform(np.random.default_rng(seed), n, spread=0.5))
-
-
-def write_rows(path, raw, names=None):
-    lines = [" ".join(map(repr, r.tolist())) for r in raw]
-    if names:
-        lines = [f"{a} {b}" for a, b in zip(names, lines, strict=True)]
-    path.write_text("\n".join(lines))
-    return path
 
 
 # --- pairing ----------------------------------------------------------------------------------
@@ -122,7 +110,8 @@ def test_unpaired_unmeasured_and_duplicates_are_named(tmp_path):
     raw[5] = np.nan
     raw[9] = raw[8]
     listed = [*names[:11], "gone.png"]
-    found = read_image_folder(images, write_rows(tmp_path / "p.txt", raw, listed), reading=READING)
+    poses = write_lines(tmp_path / "p.txt", raw, names=listed)
+    found = read_image_folder(images, poses, reading=READING)
     assert found.labels == tuple(n for k, n in enumerate(names) if k not in (5, 11))
     assert dict(found.unpaired_images).keys() == {"5.png", "11.png"}
     assert dict(found.unpaired_poses).keys() == {"line 6", "line 12"}
@@ -134,14 +123,13 @@ def test_unpaired_unmeasured_and_duplicates_are_named(tmp_path):
 
 def test_a_reading_must_be_said_and_must_fit(tmp_path):
     images = make_images(tmp_path / "i", [f"{k}.png" for k in range(4)])
-    file = write_rows(tmp_path / "p.txt", rows(4))
+    file = write_lines(tmp_path / "p.txt", rows(4))
     found = read_image_folder(images, file)
     assert found.reading is None
     refused(r"not said.*quat_xyzw,m; quat_wxyz,m", found.Ts_base_ee)
     with pytest.raises(InputError, match="takes 6 numbers"):
         read_image_folder(images, file, reading=reading_from_text("rotvec,m"))
-    named = [",".join(map(repr, r.tolist())) for r in rows(4)]
-    file.write_text("\n".join(["x_m,y_m,z_m,qx,qy,qz,qw", *named]))
+    write_lines(file, rows(4), ",", head="x_m,y_m,z_m,qx,qy,qz,qw")
     turned = read_image_folder(images, file, reading=reading_from_text("quat_wxyz,m"))
     assert "contradicts the file" in turned.warnings[0] and len(turned.Ts_base_ee()) == 4
 
@@ -149,7 +137,7 @@ def test_a_reading_must_be_said_and_must_fit(tmp_path):
 def test_poses_and_depth_beside_the_images(tmp_path):
     raw = rows(11)
     for k, row in enumerate(raw):
-        save(tmp_path / f"color_{k}.jpg", pixels(k))
+        save(tmp_path / f"color_{k}.jpg", tiny(k))
         Image.fromarray(np.full((4, 4), 500 + k, np.uint16)).save(tmp_path / f"depth_{k}.png")
         (tmp_path / f"pose_{k}.json").write_text(json.dumps({"pose": row.tolist()}))
     (tmp_path / "camera.json").write_text('{"fx": 600}')
@@ -163,7 +151,7 @@ def test_poses_and_depth_beside_the_images(tmp_path):
 
 def test_a_camera_beside_one_pose_file_is_no_pose_file(tmp_path):
     make_images(tmp_path, [f"{k}.png" for k in range(4)])
-    write_rows(tmp_path / "p.txt", rows(4))
+    write_lines(tmp_path / "p.txt", rows(4))
     (tmp_path / "lens.json").write_text(json.dumps({"fx": 600, "fy": 600, "cx": 320, "cy": 240}))
     found = read_image_folder(tmp_path, tmp_path, reading=READING)
     assert len(found) == 4 and any("lens.json" in n for n in found.poses.notes)
@@ -174,7 +162,7 @@ def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
     (tmp_path / "p").mkdir()
     raw = rows(6)
     for k in range(6):
-        write_rows(tmp_path / "p" / f"{k}.txt", raw[k : k + 1])
+        write_lines(tmp_path / "p" / f"{k}.txt", raw[k : k + 1])
     turned = [{"pose": f"p/{k}.txt", "image": f"i/{5 - k}.png"} for k in range(6)]
     (tmp_path / "cal.json").write_text(json.dumps({"data": turned}))
     (tmp_path / "others.json").write_text('{"pose": 1, "image": 2,')
@@ -189,11 +177,11 @@ def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
 
 def test_files_that_differ_or_hold_several_poses_are_named(tmp_path):
     for k in range(3):
-        write_rows(tmp_path / f"{k}.txt", rows(1, k))
+        write_lines(tmp_path / f"{k}.txt", rows(1, k))
     (tmp_path / "1.txt").write_text("1 2 3 0.1 0.2 0.3\n")
     make_images(tmp_path / "i", ["0.png", "1.png", "2.png"])
     refused(r"1.txt holds 6 numbers, 0.txt 7 numbers", read_image_folder, tmp_path / "i", tmp_path)
-    write_rows(tmp_path / "1.txt", rows(2))
+    write_lines(tmp_path / "1.txt", rows(2))
     refused(r"1.txt holds 2 poses; beside 2 other", read_image_folder, tmp_path / "i", tmp_path)
 
 
@@ -205,7 +193,7 @@ def test_folders_without_usable_images_say_what_is_there(tmp_path):
     deep.mkdir()
     Image.fromarray(np.zeros((4, 4), np.uint16)).save(deep / "0.png")
     refused("1 images of 16 bit and none of 8", list_images, deep)
-    save(tmp_path / "colour" / "0.jpg", pixels(0))
+    save(tmp_path / "colour" / "0.jpg", tiny(0))
     refused("two images of one name", list_images, tmp_path / "colour")
 
 
@@ -237,7 +225,7 @@ def test_all_broken_images_are_named_at_once_with_what_to_do(tmp_path):
 def test_results_are_no_pose_of_a_set_with_one_folder_a_pose(tmp_path):
     for k in range(3):
         make_images(tmp_path / f"pose_{k}", ["image.png"])
-        write_rows(tmp_path / f"pose_{k}/pose.txt", rows(1))
+        write_lines(tmp_path / f"pose_{k}/pose.txt", rows(1))
     make_images(tmp_path / "calibration", ["views.png", "lens.png"])
     (tmp_path / "calibration/calibrated_of.json").write_text("{}")
     found = read_image_folder(tmp_path, tmp_path)
@@ -248,11 +236,11 @@ def test_results_are_no_pose_of_a_set_with_one_folder_a_pose(tmp_path):
 
 
 def test_board_poses_of_other_count_are_refused(tmp_path):
-    a, b = write_rows(tmp_path / "a.txt", rows(5)), write_rows(tmp_path / "b.txt", rows(4))
+    a, b = write_lines(tmp_path / "a.txt", rows(5)), write_lines(tmp_path / "b.txt", rows(4))
     refused("5 robot poses and 4 board poses", read_board_poses, a, b)
     names = [f"{k}.png" for k in range(5)]
-    a = write_rows(tmp_path / "a.txt", rows(5), names)
-    b = write_rows(tmp_path / "b.txt", rows(5)[[4, 2, 0]], [names[4], names[2], names[0]])
+    a = write_lines(tmp_path / "a.txt", rows(5), names=names)
+    b = write_lines(tmp_path / "b.txt", rows(5)[[4, 2, 0]], names=names[::-2])
     both = read_board_poses(a, b)
     assert np.array_equal(both.robot.values, both.board.values) and len(both.robot) == 3
     assert [w for w, _ in both.unpaired_robot] == ["line 2", "line 4"]
@@ -262,7 +250,7 @@ def test_board_poses_of_other_count_are_refused(tmp_path):
 
 
 def test_lossless_images_come_back_exactly(tmp_path):
-    colour, grey = pixels(1), pixels(2)[..., 0]
+    colour, grey = tiny(1), tiny(2)[..., 0]
     for ending in ("png", "tif"):
         assert np.array_equal(load_image(save(tmp_path / f"c.{ending}", colour)), colour)
     loaded = load_image(save(tmp_path / "g.png", grey))
@@ -278,7 +266,7 @@ def test_images_that_are_no_plain_colour_are_refused(tmp_path):
     turned = tmp_path / "turned.jpg"
     exif = Image.Exif()
     exif[0x0112] = 6
-    Image.fromarray(pixels(6)).save(turned, exif=exif)
+    Image.fromarray(tiny(6)).save(turned, exif=exif)
     (tmp_path / "text.png").write_text("no image")
     deep_colour = tmp_path / "deep_colour.png"
     cv2.imwrite(str(deep_colour), np.full((8, 8, 3), 40000, np.uint16))
@@ -299,7 +287,7 @@ def test_images_that_are_no_plain_colour_are_refused(tmp_path):
 )
 def test_no_damage_whatever_ends_in_a_traceback(place, byte, ending):
     with tempfile.TemporaryDirectory() as folder:
-        path = save(Path(folder) / f"a.{ending}", pixels(7))
+        path = save(Path(folder) / f"a.{ending}", tiny(7))
         data = bytearray(path.read_bytes())
         data[int(place * (len(data) - 1))] = byte
         path.write_bytes(bytes(data))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pose_rows import all_readings, folder, random_poses, rows_of
+from pose_rows import all_readings, folder, random_poses, rows_of, write_lines
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
 from realsim_calibration.inputs.pose_file import read_pose_file
@@ -21,20 +21,6 @@ from realsim_calibration.inputs.readings import (
 from refusals import refused
 
 # --- every reading in every layout --------------------------------------------------------------
-
-
-def number(x, comma=False):
-    text = repr(float(x))
-    return text.replace(".", ",") if comma else text
-
-
-def write_lines(path, raw, separator, names=None, head="", comma=False):
-    lines = [head] if head else []
-    for k, row in enumerate(raw):
-        fields = [number(x, comma) for x in row]
-        lines.append(separator.join([names[k], *fields] if names else fields))
-    path.write_text("\n".join(lines) + "\n")
-    return path
 
 
 def as_json(path, tree):
@@ -71,7 +57,7 @@ LAYOUTS = {
     "spaces": lambda d, r, n: write_lines(d / "a.txt", r, " ", head="# exported"),
     "commas": lambda d, r, n: write_lines(d / "a.csv", r, ","),
     "named lines": lambda d, r, n: write_lines(d / "a.csv", r, ",", n),
-    "decimal commas": lambda d, r, n: write_lines(d / "a.csv", r, ";", comma=True),
+    "decimal commas": lambda d, r, n: write_lines(d / "a.csv", r, ";", decimal=","),
     "tabs": lambda d, r, n: write_lines(d / "a.tsv", r, "\t", n),
     "UR": lambda d, r, n: write_lines(d / "a.log", r, ", ", head="") and brackets(d / "a.log"),
     "json nested": lambda d, r, n: as_json(d / "a.json", {"poses": square(r), "images": n}),
@@ -213,7 +199,7 @@ def test_time_stamps_from_1970_and_from_the_machines_start(tmp_path, start, stop
 
 def test_text_of_spreadsheets_and_windows(tmp_path):
     raw = rows_of(reading_from_text("rotvec,m"), random_poses(12, 4))
-    text = "\r\n".join(" ".join(map(number, r)) for r in raw)
+    text = "\r\n".join(" ".join(map(repr, row)) for row in raw.tolist())
     encoded = (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
     for k, data in enumerate(encoded):
         (tmp_path / f"{k}.txt").write_bytes(data)
@@ -252,7 +238,7 @@ def test_ros_poses_and_parts(tmp_path):
 
 def test_matrices_as_blocks_of_lines_and_of_few_decimals(tmp_path):
     T = random_poses(9, 5)
-    text = "\n\n".join("\n".join(" ".join(map(number, row)) for row in t) for t in T)
+    text = "\n\n".join("\n".join(" ".join(map(repr, row)) for row in t) for t in T.tolist())
     (tmp_path / "a.txt").write_text(text)
     found = read_pose_file(tmp_path / "a.txt")
     assert str(found.stated) == "matrix,m" and found.where[1] == "line 6"

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pictured_folders import save_pictures
-from pose_rows import rows_of
+from pose_rows import rows_of, write_lines
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim_calibration.inputs.readings import reading_from_text
@@ -53,39 +53,30 @@ def visp(values: list[float]) -> str:
     return f"# pose\nrows: {len(values)}\ncols: 1\ndata:\n{lines}"
 
 
-def _lines(path: Path, rows: Array, head: str = "", names: list[str] | None = None) -> Path:
-    text = [" ".join(map(repr, r.tolist())) for r in rows]
-    if names:
-        text = [f"{n} {t}" for n, t in zip(names, text, strict=True)]
-    path.write_text("\n".join([head, *text] if head else text) + "\n")
-    return path
-
-
 def text_by_number(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """Line i of a txt belongs to image i."""
     save_images(d, shots, "0-{}.jpg")
-    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts)), "rotvec,m"
+    return d, write_lines(d / "poses.txt", rows_of(ROTVEC, Ts)), "rotvec,m"
 
 
 def text_by_name(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """Every line begins with the image's name."""
-    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts), names=save_images(d, shots)), "rotvec,m"
+    names = save_images(d, shots)
+    return d, write_lines(d / "poses.txt", rows_of(ROTVEC, Ts), names=names), "rotvec,m"
 
 
 def csv_with_names(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """A csv with a header, units in it, millimetres and degrees."""
     names = save_images(d, shots)
     rows = rows_of(reading_from_text("euler_xyz,deg,mm"), Ts)
-    text = ["image,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"]
-    text += [",".join([n, *map(repr, r.tolist())]) for n, r in zip(names, rows, strict=True)]
-    (d / "poses.csv").write_text("\n".join(text))
-    return d, d / "poses.csv", "euler_xyz,deg,mm"
+    head = "image,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
+    return d, write_lines(d / "poses.csv", rows, ",", names, head), "euler_xyz,deg,mm"
 
 
 def matrices_in_text(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """4x4 matrices, four lines each."""
     save_images(d, shots)
-    return d, _lines(d / "poses.txt", Ts.reshape(-1, 4)), ""
+    return d, write_lines(d / "poses.txt", Ts.reshape(-1, 4)), ""
 
 
 def json_list(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
@@ -125,7 +116,7 @@ def text_beside(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """A txt beside every image."""
     save_images(d, shots)
     for k, row in enumerate(rows_of(ROTVEC, Ts)):
-        _lines(d / f"{k:02d}.txt", row[None])
+        write_lines(d / f"{k:02d}.txt", row[None])
     return d, d, "rotvec,m"
 
 
@@ -182,7 +173,7 @@ def folder_a_pose(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 def images_below(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """images/ and a pose file above."""
     save_images(d / "images", shots)
-    return d, _lines(d / "poses.txt", Ts.reshape(-1, 16)).parent, ""
+    return d, write_lines(d / "poses.txt", Ts.reshape(-1, 16)).parent, ""
 
 
 def images_and_poses_below(d: Path, Ts: Array, shots: list[UInt8]) -> Written:

@@ -1,7 +1,7 @@
 """Poses as rows of numbers, in every reading of them, and folders for files of them."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -38,6 +38,19 @@ def all_readings() -> Iterator[PoseReading]:
 def random_poses(seed: int, n: int) -> Array:
     """Return poses (n, 4, 4) [m]."""
     return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
+
+
+def write_lines(
+    path: Path, rows: Array, separator: str = " ", names: Sequence[str] | None = None,
+    head: str = "", decimal: str = ".",
+) -> Path:  # fmt: skip
+    """Write rows of numbers as text, each after its name; return the path."""
+    lines = [head] if head else []
+    for k, row in enumerate(rows.tolist()):
+        fields = [repr(x).replace(".", decimal) for x in row]
+        lines.append(separator.join([names[k], *fields] if names else fields))
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
 def rows_of(reading: PoseReading, Ts: Array, width: int = 16) -> Array:
