@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from realsim.errors import InputError
+from realsim.errors import DegenerateError, InputError
 
 
 def refused(
@@ -15,3 +15,8 @@ def refused(
     with pytest.raises(error, match=why) as caught:
         call(*args, **options)
     return str(caught.value)
+
+
+def undetermined(why: str, call: Callable[..., object], *args: object, **options: object) -> str:
+    """Hold that what is given does not determine the answer, as `refused` does of bad input."""
+    return refused(why, call, *args, error=DegenerateError, **options)
