@@ -103,8 +103,7 @@ def test_warp_is_taken_from_the_boards_shape() -> None:
     views = sensed_views(
         rng, lambda T: sensed(exact_depth(T, CAMERA, warp), truth, rng, 0.0), points=points
     )
-    bent = estimate_depth_bias(views, BOARD, CAMERA, EXACT, shape=shape)
-    flat = estimate_depth_bias(views, BOARD, CAMERA, EXACT)
+    bent, flat = run(views, shape=shape), run(views)
     assert bent.bias.scale == pytest.approx(1.01, abs=5e-4)
     assert bent.bias.offset_per_m == pytest.approx(-0.01, abs=2e-3)
     assert bent.scatter_per_m < 0.2 * flat.scatter_per_m
@@ -118,9 +117,7 @@ def test_own_depth_camera_beside_the_colour_camera() -> None:
     views = sensed_views(
         rng, lambda T: truth.measured(exact_depth(se3.invert(beside) @ T, depth_camera))
     )
-    report = estimate_depth_bias(
-        views, BOARD, CAMERA, EXACT, depth_intrinsics=depth_camera, T_color_depth=beside
-    )
+    report = run(views, depth_intrinsics=depth_camera, T_color_depth=beside)
     assert report.bias.scale == pytest.approx(1.008, abs=1e-4)
     assert report.bias.offset_per_m == pytest.approx(-0.01, abs=4e-4)
 
@@ -203,8 +200,7 @@ def test_another_focal_length_under_the_same_size_is_refused() -> None:
 def test_another_size_is_refused() -> None:
     views = [replace(v, depth_m=v.depth_m[:150]) for v in views_of(DepthBias.none())]
     refused("resizing the image does not align it", run, views)
-    with pytest.raises(InputError, match="T_color_depth"):
-        estimate_depth_bias(views, BOARD, CAMERA, EXACT, depth_intrinsics=CAMERA)
+    refused("T_color_depth", run, views, depth_intrinsics=CAMERA)
 
 
 def test_too_little_depth_is_said_per_view() -> None:

@@ -191,15 +191,11 @@ def test_easy_handeye2_has_the_keys_of_its_message_and_no_others() -> None:
 def test_every_text_says_frames_units_accuracy_and_warnings() -> None:
     report = record(se3.from_translation([0.0, 0.0, 0.1]))
     notes = "\n".join(note_lines(report, FRAMES))
-    for text in (
-        write.easy_handeye2_text(report, FRAMES),
-        write.easy_handeye_text(report, FRAMES),
-        write.ros1_script(report, FRAMES),
-        write.ros2_script(report, FRAMES),
-        write.ros2_launch_text(report, FRAMES),
-        write.urdf_text(report, FRAMES),
-        opencv_text(report, FRAMES),
-    ):
+    for text_of in (
+        write.easy_handeye2_text, write.easy_handeye_text, write.ros1_script, write.ros2_script,
+        write.ros2_launch_text, write.urdf_text, opencv_text,
+    ):  # fmt: skip
+        text = text_of(report, FRAMES)
         assert "OPTICAL" in text and "Metres" in text and "1 sigma" in text
         assert "WITHOUT the robot's error map" in text and "WARNING" in text
     assert "alert(1)" in notes and all("\n" not in n for n in note_lines(report, FRAMES))

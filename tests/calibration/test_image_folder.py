@@ -1,5 +1,4 @@
 import json
-import tempfile
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pose_layouts import LAYOUTS, PAIRS, folder_a_pose, layouts_read, save_images, tiny
-from pose_rows import rows_of, write_lines
+from pose_rows import folder, rows_of, write_lines
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
@@ -283,13 +282,13 @@ def test_images_that_are_no_plain_colour_are_refused(tmp_path):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    place=st.floats(0, 1), byte=st.integers(0, 255), ending=st.sampled_from(["png", "jpg", "tif"])
+    share=st.floats(0, 1), byte=st.integers(0, 255), ending=st.sampled_from(["png", "jpg", "tif"])
 )
-def test_no_damage_whatever_ends_in_a_traceback(place, byte, ending):
-    with tempfile.TemporaryDirectory() as folder:
-        path = save(Path(folder) / f"a.{ending}", tiny(7))
+def test_no_damage_whatever_ends_in_a_traceback(share, byte, ending):
+    with folder() as place:
+        path = save(place / f"a.{ending}", tiny(7))
         data = bytearray(path.read_bytes())
-        data[int(place * (len(data) - 1))] = byte
+        data[int(share * (len(data) - 1))] = byte
         path.write_bytes(bytes(data))
         try:
             image = load_image(path)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -130,5 +131,5 @@ def sensed_views(
     return found
 
 
-def run(views: list[DepthBoardView], config: DepthBiasConfig | None = EXACT) -> DepthBiasReport:
-    return estimate_depth_bias(views, BOARD, CAMERA, config)
+def run(views: list[DepthBoardView], **given: Any) -> DepthBiasReport:
+    return estimate_depth_bias(views, BOARD, CAMERA, EXACT, **given)
