@@ -258,7 +258,7 @@ def test_the_file_reads_back(tmp_path: Path) -> None:
 
 
 def blind(rig: Rig) -> Rig:
-    nothing = TargetDetection(point_ids=np.zeros(0), uv=np.zeros((0, 2)), image_size=(1280, 960))
+    nothing = TargetDetection(point_ids=np.arange(0), uv=np.zeros((0, 2)), image_size=(1280, 960))
     return rig.only([replace(s, detection=nothing) if s.camera == 2 else s for s in rig.sightings])
 
 

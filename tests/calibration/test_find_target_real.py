@@ -17,23 +17,14 @@ from refusals import refused
 
 DATA = real_data.DATA / "handeye"
 pytestmark = [pytest.mark.real, real_data.needs(DATA)]
-SETS = {
-    "rtde_ur5e": (
-        "Hand-Eye-Data/*.jpg",
-        CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100"),
-    ),
-    "rosi_circles": (
-        "images/*.png",
-        CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True),
-    ),
-}
+CIRCLES = CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True)
 
 
-def load(name, every=1):
-    pattern, target = SETS[name]
-    files = sorted((DATA / name).glob(pattern), key=lambda p: int(p.stem.split("-")[-1]))
-    assert files, f"no pictures in {DATA / name}"
-    return [cv2.cvtColor(cv2.imread(str(f)), cv2.COLOR_BGR2RGB) for f in files[::every]], target
+def load(pattern, every):
+    """Return the files of a set of pictures and every so many of the pictures."""
+    files = sorted(DATA.glob(pattern), key=lambda p: int(p.stem.split("-")[-1]))
+    assert files, f"no pictures {DATA / pattern}"
+    return files, [cv2.cvtColor(cv2.imread(str(f)), cv2.COLOR_BGR2RGB) for f in files[::every]]
 
 
 def opencv_points(image, target):
@@ -63,9 +54,8 @@ def camera_rms(uvs, target, size):
 
 @pytest.mark.slow
 def test_all_views_are_found_and_fit_a_camera_better_than_with_opencv():
-    name = "rosi_circles"
-    pictures, target = load(name, every=3)
-    board = target.points_board
+    target, board = CIRCLES, CIRCLES.points_board
+    _, pictures = load("rosi_circles/images/*.png", every=3)
     ours, theirs = [], []
     for image in pictures:
         d = find_target(image, target)
@@ -83,23 +73,21 @@ def test_all_views_are_found_and_fit_a_camera_better_than_with_opencv():
         theirs.append(matched)
     size = (pictures[0].shape[1], pictures[0].shape[0])
     a, b = camera_rms(ours, target, size), camera_rms(theirs, target, size)
-    print(f"{name}: {len(pictures)} views, {a:.4f} px, with OpenCV's points {b:.4f} px")
+    print(f"{len(pictures)} views, {a:.4f} px, with OpenCV's points {b:.4f} px")
     assert a < b
 
 
 def test_untouched_photographs_are_not_said_to_be_drawn_on():
-    pictures, target = load("rosi_circles", every=5)
-    for image in pictures:
-        found = find_target(image, target)
+    for image in load("rosi_circles/images/*.png", every=5)[1]:
+        found = find_target(image, CIRCLES)
         assert len(found) > 90 and not any(r.startswith(DRAWN) for r in found.rejected)
 
 
 @pytest.mark.slow
 def test_a_wrong_board_file_is_answered_with_what_is_there():
-    pictures, _ = load("rtde_ur5e", every=1000)
-    first = min((DATA / "rtde_ur5e/Hand-Eye-Data").glob("*.jpg"), key=lambda p: int(p.stem))
+    files, pictures = load("rtde_ur5e/Hand-Eye-Data/*.jpg", every=1000)
     wrong = CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02)
     d = find_target(pictures[0], wrong)
     assert len(d) == 0
-    folder: Any = SimpleNamespace(images=[first], labels=["0.jpg"])
+    folder: Any = SimpleNamespace(images=files[:1], labels=["0.jpg"])
     refused(r"dict=APRILTAG_36h11.*17 markers of DICT_6X6_50", require_target, folder, [d], wrong)
