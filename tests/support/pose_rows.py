@@ -1,7 +1,7 @@
 """Poses as rows of numbers, in every reading of them, and folders for files of them."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -16,7 +16,7 @@ from realsim_calibration.inputs.readings import ROTATIONS, PoseReading
 
 
 @contextmanager
-def folder() -> Iterator[Path]:
+def folder() -> Generator[Path, None, None]:
     """Give a folder for as long as the block lasts: an example of hypothesis has its own."""
     with tempfile.TemporaryDirectory() as path:
         yield Path(path)
