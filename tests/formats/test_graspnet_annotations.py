@@ -31,6 +31,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim.geometry.mesh import load_mesh
 from refusals import refused
+from upgradable_datasets import annotation_xml
 
 
 def test_poses_lose_nothing_in_the_text():
@@ -84,19 +85,6 @@ def poses_on_table():
     return dict(zip(NUMBERS, Ts, strict=True))
 
 
-def annotation(Ts_cam_obj):
-    rows = []
-    for number, T in Ts_cam_obj.items():
-        q, t = se3.quaternion_wxyz(T[:3, :3]), T[:3, 3]
-        rows.append(
-            f"<obj><obj_id>{number}</obj_id><obj_name>{number:03d}.ply</obj_name>"
-            f"<obj_path>models/{number:03d}.ply</obj_path>"
-            f"<pos_in_world>{t[0]:.4f} {t[1]:.4f} {t[2]:.4f}</pos_in_world>"
-            f"<ori_in_world>{q[0]:.4f} {q[1]:.4f} {q[2]:.4f} {q[3]:.4f}</ori_in_world></obj>"
-        )
-    return f"<scene>{''.join(rows)}</scene>"
-
-
 @pytest.fixture
 def dataset(tmp_path):
     """Return the folder of a scene of a data set."""
@@ -111,7 +99,7 @@ def dataset(tmp_path):
     for i, T in enumerate(relative):
         inverse = se3.invert(first @ T)
         seen = {n: inverse @ T_obj for n, T_obj in poses_on_table().items()}
-        (root / "annotations" / f"{i:04d}.xml").write_text(annotation(seen))
+        (root / "annotations" / f"{i:04d}.xml").write_text(annotation_xml(seen))
     for n in NUMBERS:
         folder = tmp_path / "models" / f"{n:03d}"
         folder.mkdir(parents=True)
@@ -135,7 +123,7 @@ def test_an_image_that_disagrees_is_named(dataset):
     path = dataset / "kinect/annotations/0002.xml"
     seen = read_annotation(path)
     seen[27] = se3.from_translation([0.02, 0, 0]) @ seen[27]
-    path.write_text(annotation(seen))
+    path.write_text(annotation_xml(seen))
     (note,) = [n for n in read_graspnet_scene(dataset).notes if "elsewhere" in n]
     assert "object 027" in note and "image 2" in note and "20." in note
 

@@ -4,10 +4,10 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bop_scenes import png
 from file_trees import bytes_of
 from plain_meshes import square
 from realsim.arrays import Array, UInt8
@@ -53,14 +53,11 @@ def grey_of(labels: Labels) -> UInt8:
 def bop_scene(folder: Path, *, turn: float = 0.0, views: int = 1, off_m: float = 0.0) -> None:
     """Write one BOP scene whose annotations are off by so much along the camera's x."""
     placed = standing(turn)
-    for name in ("rgb", "depth", "mask", "mask_visib"):
-        (folder / name).mkdir(parents=True)
     scene_camera, scene_gt = {}, {}
     for k, (labels, T) in enumerate(zip(looks(placed, views), cameras(views), strict=True)):
         index = 3 + k
-        cv2.imwrite(str(folder / f"rgb/{index:06d}.png"), grey_of(labels))
-        depth = np.round(labels.depth_m * 1e4).astype(np.uint16)
-        cv2.imwrite(str(folder / f"depth/{index:06d}.png"), depth)
+        png(folder / f"rgb/{index:06d}.png", grey_of(labels))
+        png(folder / f"depth/{index:06d}.png", np.round(labels.depth_m * 1e4).astype(np.uint16))
         T_cam_world = se3.invert(T)
         scene_camera[str(index)] = {
             "cam_K": CAMERA.K.ravel().tolist(), "depth_scale": 0.1,
@@ -74,8 +71,7 @@ def bop_scene(folder: Path, *, turn: float = 0.0, views: int = 1, off_m: float =
             R = T_cam_obj[:3, :3].ravel().tolist()
             rows.append({"obj_id": part(NAMES[m]).obj_id, "cam_R_m2c": R, "cam_t_m2c": t.tolist()})
             for kind, mask in (("mask", labels.amodal[m]), ("mask_visib", labels.visible(m))):
-                file = folder / f"{kind}/{index:06d}_{m:06d}.png"
-                cv2.imwrite(str(file), 255 * mask.astype(np.uint8))
+                png(folder / f"{kind}/{index:06d}_{m:06d}.png", 255 * mask.astype(np.uint8))
         scene_gt[str(index)] = rows
     (folder / "scene_camera.json").write_text(json.dumps(scene_camera))
     (folder / "scene_gt.json").write_text(json.dumps(scene_gt))
@@ -91,34 +87,38 @@ def bop_dataset(root: Path, scenes: int = 1, *, views: int = 1, off_m: float = 0
     return root
 
 
+def annotation_xml(Ts_cam_obj: dict[int, Array]) -> str:
+    """Return GraspNet's annotation of objects by their numbers, with its four decimals."""
+    nodes: list[str] = []
+    for number, T in Ts_cam_obj.items():
+        q = np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)
+        t, q = (" ".join(f"{x:.4f}" for x in v) for v in (T[:3, 3], q))
+        nodes.append(
+            f"<obj><obj_id>{number}</obj_id><obj_name>{number:03d}.ply</obj_name>"
+            f"<obj_path>models/{number:03d}.ply</obj_path>"
+            f"<pos_in_world>{t}</pos_in_world><ori_in_world>{q}</ori_in_world></obj>"
+        )
+    return f"<scene>{''.join(nodes)}</scene>"
+
+
 def graspnet_dataset(root: Path, number: int = 100) -> Path:
     """Write a GraspNet tree of one scene seen by the Kinect in two images; return its root."""
     home = root / f"scenes/scene_{number:04d}"
     folder = home / "kinect"
-    for name in ("rgb", "depth", "label", "annotations"):
-        (folder / name).mkdir(parents=True)
+    (folder / "annotations").mkdir(parents=True)
     placed = standing()
     Ts = cameras(2)
     numbers = [part(n).obj_id - 1 for n in NAMES]
     for k, (labels, T) in enumerate(zip(looks(placed, 2), Ts, strict=True)):
-        cv2.imwrite(str(folder / f"rgb/{k:04d}.png"), grey_of(labels))
-        depth = np.round(labels.depth_m * 1e3).astype(np.uint16)
-        cv2.imwrite(str(folder / f"depth/{k:04d}.png"), depth)
+        png(folder / f"rgb/{k:04d}.png", grey_of(labels))
+        png(folder / f"depth/{k:04d}.png", np.round(labels.depth_m * 1e3).astype(np.uint16))
         label = np.zeros(labels.ids.shape, np.uint8)
-        nodes: list[str] = []
+        seen: dict[int, Array] = {}
         for m, p in enumerate(placed):
             label[labels.visible(m)] = numbers[m] + 1
-            T_cam_obj = se3.invert(T) @ p.T_world_obj
-            q = np.roll(Rotation.from_matrix(T_cam_obj[:3, :3]).as_quat(), 1)
-            words = [" ".join(f"{x:.4f}" for x in v) for v in (T_cam_obj[:3, 3], q)]
-            nodes.append(
-                f"<obj><obj_id>{numbers[m]}</obj_id><obj_name>{numbers[m]:03d}</obj_name>"
-                f"<obj_path>models/{numbers[m]:03d}</obj_path>"
-                f"<pos_in_world>{words[0]}</pos_in_world>"
-                f"<ori_in_world>{words[1]}</ori_in_world></obj>"
-            )
-        cv2.imwrite(str(folder / f"label/{k:04d}.png"), label)
-        (folder / f"annotations/{k:04d}.xml").write_text(f"<scene>{''.join(nodes)}</scene>")
+            seen[numbers[m]] = se3.invert(T) @ p.T_world_obj
+        png(folder / f"label/{k:04d}.png", label)
+        (folder / f"annotations/{k:04d}.xml").write_text(annotation_xml(seen))
     np.save(folder / "camK.npy", CAMERA.K)
     np.save(folder / "cam0_wrt_table.npy", Ts[0])
     np.save(folder / "camera_poses.npy", np.stack([se3.invert(Ts[0]) @ T for T in Ts]))
