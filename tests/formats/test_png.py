@@ -81,6 +81,11 @@ def strict(data):
     return pixels.reshape(height, width, 3) if colour == 2 else pixels
 
 
+def decoded(data: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image[..., ::-1] if image.ndim == 3 else image
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     kind=st.sampled_from(KINDS),
@@ -102,9 +107,8 @@ def test_every_pixel_comes_back_from_every_reader(kind, height, width, texture, 
     assert data == encode_png(image.copy())
     expected = image.astype(np.uint8) * 255 if image.dtype == bool else image
     assert np.array_equal(strict(data), expected)
-    read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert read.dtype == expected.dtype
-    assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, expected)
+    read = decoded(data)
+    assert read.dtype == expected.dtype and np.array_equal(read, expected)
     with Image.open(io.BytesIO(data)) as opened:
         opened.load()
         grey = "L" if expected.itemsize == 1 else "I;16"
@@ -138,11 +142,6 @@ def test_what_png_cannot_hold_is_refused(image):
 WINDOWS = [
     (0, 0, 64, 48), (0, 0, 0, 0), (5, 7, 1, 1), (60, 40, 4, 8), (0, 10, 64, 3), (3, 0, 9, 48),
 ]  # fmt: skip
-
-
-def decoded(data: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return image[..., ::-1] if image.ndim == 3 else image
 
 
 @pytest.mark.parametrize(("x", "y", "w", "h"), WINDOWS)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fault_sessions import losses
-from plain_meshes import square
+from plain_meshes import card
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.loss import material_loss, signal_loss
@@ -124,13 +124,6 @@ def test_a_given_shadow_is_lost_and_mistakes_are_named() -> None:
 WIDE = CameraIntrinsics(width=160, height=120, fx=160, fy=160, cx=79.5, cy=59.5)
 EXACT = DepthSensorModel.noiseless()
 BLACK = Material(base_color=(0.001, 0.001, 0.001))
-
-
-def card(
-    instance: int, z: float, half: float, material: Material | None = None, x: float = 0.0
-) -> PlacedMesh:
-    mesh = Mesh(vertices=square(half).vertices + np.array([x, 0, z]), faces=square().faces[:, ::-1])
-    return PlacedMesh(instance, mesh, np.eye(4), material)
 
 
 SCENE = [card(BACKGROUND, 0.6, 1.0, Material()), card(0, 0.4, 0.06, BLACK)]

@@ -8,6 +8,8 @@ import numpy as np
 from realsim.geometry.mesh import box_mesh
 from realsim.geometry.parts import part
 from realsim.records import Mesh
+from realsim.rendering.appearance import Material
+from realsim.rendering.rays import PlacedMesh
 
 
 def box(size: Sequence[float], color: tuple[int, int, int] | None = None) -> Mesh:
@@ -22,6 +24,14 @@ def square(half: float = 0.5) -> Mesh:
     ring = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     vertices, faces = half * (2 * ring - [1, 1, 0]), np.array([[0, 1, 2], [0, 2, 3]])
     return Mesh(vertices=vertices, faces=faces, uv=ring[:, :2])
+
+
+def card(
+    instance: int, z: float, half: float, material: Material | None = None, x: float = 0.0
+) -> PlacedMesh:
+    """A square before a camera at the origin that looks along z."""
+    mesh = Mesh(vertices=square(half).vertices + np.array([x, 0, z]), faces=square().faces[:, ::-1])
+    return PlacedMesh(instance, mesh, np.eye(4), material)
 
 
 def textured_wedge() -> Mesh:

@@ -40,11 +40,9 @@ def quaternion(T: Array) -> dict[str, float]:
 
 def ros(T: Array) -> dict[str, dict[str, float]]:
     """Return one pose as a geometry_msgs/Pose."""
-    row = rows_of(QUATERNION, T[None])[0].tolist()
-    return {
-        "position": dict(zip("xyz", row[:3], strict=True)),
-        "orientation": dict(zip("xyzw", row[3:], strict=True)),
-    }
+    named = quaternion(T)
+    turn = {n: named[f"q{n}"] for n in "xyzw"}
+    return {"position": {n: named[n] for n in "xyz"}, "orientation": turn}
 
 
 def visp(values: list[float]) -> str:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from begun_sessions import begun
+from begun_sessions import add_drawn, begun
 from plain_meshes import box
-from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane, View
+from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.arrays import Array, UInt8
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -92,11 +93,12 @@ def _make(folder: Path, larger: int) -> None:
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, table])
     rng = np.random.default_rng(1)
-    for index, T in enumerate(CAMERAS):
-        labels = renderer.render(camera, T)
-        rgb = np.stack([np.where(labels.ids == 0, 200, 90)] * 3, -1)
-        rgb = (rgb + rng.integers(0, 20, rgb.shape)).astype(np.uint8)
-        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
+
+    def noisy(ids: Array) -> UInt8:
+        rgb = np.where(ids[..., None] == 0, 200, 90).repeat(3, -1)
+        return (rgb + rng.integers(0, 20, rgb.shape)).astype(np.uint8)
+
+    add_drawn(store, renderer, CAMERAS, noisy)
     save_scene(store, SCENE)
     for placed_object in SCENE.objects:
         save_grasps(store, grasp_set(placed_object.obj_id, placed_object.instance))

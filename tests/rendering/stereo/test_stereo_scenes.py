@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from grey_planes import grey_plane, plane_noise
-from plain_meshes import square
+from plain_meshes import card
 from realsim.geometry import camera as lens
-from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
@@ -37,13 +36,8 @@ FAR, NEAR = 0.8, 0.5
 WIDE = replace(profile("d435"), pattern="none", quantum_px=0.0)
 
 
-def card(z: float, half: float, material: Material) -> PlacedMesh:
-    mesh = Mesh(vertices=square(half).vertices, faces=square().faces[:, ::-1])
-    return PlacedMesh(0, mesh, se3.from_translation([0, 0, z]), material)
-
-
 MATTE = Material(base_color=(0.6, 0.6, 0.6), roughness=1.0)
-CARD_BEFORE_WALL = [grey_plane(CAMERA, FAR), card(NEAR, 0.08, MATTE)]
+CARD_BEFORE_WALL = [grey_plane(CAMERA, FAR), card(0, NEAR, 0.08, MATTE)]
 
 
 def seen(
@@ -86,7 +80,7 @@ def test_a_blank_wall_has_no_depth_until_dots_fall_on_it() -> None:
 
 def test_a_highlight_of_polished_metal_misleads_or_is_lost_and_matte_paint_is_not() -> None:
     def good(material: Material) -> float:
-        scene = [grey_plane(CAMERA, FAR), card(NEAR, 0.1, material)]
+        scene = [grey_plane(CAMERA, FAR), card(0, NEAR, 0.1, material)]
         on = seen(scene, WIDE, StereoConfig()).depth_m[80:160, 140:220]
         return float(np.mean(np.abs(on - NEAR) < 0.005))
 
@@ -97,7 +91,7 @@ def test_a_highlight_of_polished_metal_misleads_or_is_lost_and_matte_paint_is_no
 def test_dark_things_far_away_are_lost_by_structured_light() -> None:
     def fill(grey: float, z: float) -> float:
         paint = Material(base_color=(grey,) * 3, roughness=1.0)
-        d = seen([card(z, z, paint)], profile("structured_light"), StereoConfig()).depth_m
+        d = seen([card(0, z, z, paint)], profile("structured_light"), StereoConfig()).depth_m
         return float(np.mean(d[40:-40, 60:-40] > 0))
 
     assert fill(0.5, 0.6) == 1.0 and fill(0.5, 2.0) == 1.0
