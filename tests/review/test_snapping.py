@@ -97,7 +97,11 @@ def test_what_belongs_to_a_neighbour_does_not_draw_an_object_to_it(snapper: Snap
 
 def test_a_symmetric_object_keeps_the_turn_it_was_given(tmp_path: Path) -> None:
     """Nothing tells how a tube is turned about its axis."""
-    stored, placed = tube_session(tmp_path / "tube")
+    T = se3.from_translation([0.0, 0.0, -TUBE.mesh.bounds[0, 2]])
+    placed = ObjectPose(obj_id=TUBE.obj_id, instance=0, T_world_obj=T)
+    table = PlacedMesh(-1, square(0.5), np.eye(4))
+    renderer = LabelRenderer([PlacedMesh(0, TUBE.mesh, T), table])
+    stored = add_drawn(begun(tmp_path / "tube", CAMERA), renderer, true_cameras(3))
     scene = Scene(name="tube", objects=(placed,), plane=SCENE.plane)
     spun = pushed(placed, 5.0, 0.0) @ se3.exp(np.array([0, 0, 0.7, 0, 0, 0]))
     found = Snapper(stored, scene, {TUBE.obj_id: TUBE}).snap(0, TUBE.obj_id, spun)
@@ -106,15 +110,6 @@ def test_a_symmetric_object_keeps_the_turn_it_was_given(tmp_path: Path) -> None:
     turned = placed.T_world_obj[:3, :3].T @ found.T_world_obj[:3, :3]
     assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(0.7, abs=0.02)
     assert found.moved_mm == pytest.approx(5.0, abs=0.3)
-
-
-def tube_session(folder: Path) -> tuple[SessionStore, ObjectPose]:
-    """Return a session of one tube on a table, and where it stands."""
-    T = se3.from_translation([0.0, 0.0, -TUBE.mesh.bounds[0, 2]])
-    table = PlacedMesh(-1, square(0.5), np.eye(4))
-    renderer = LabelRenderer([PlacedMesh(0, TUBE.mesh, T), table])
-    store = add_drawn(begun(folder, CAMERA), renderer, true_cameras(3))
-    return store, ObjectPose(obj_id=TUBE.obj_id, instance=0, T_world_obj=T)
 
 
 def test_two_views_are_enough_for_a_snap(store: SessionStore) -> None:

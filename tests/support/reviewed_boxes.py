@@ -78,17 +78,12 @@ def boxes_session(folder: Path, larger: int = 1) -> SessionStore:
 def _original(larger: int) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="boxes_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _make(folder / "boxes", larger)
-    return folder / "boxes"
-
-
-def _make(folder: Path, larger: int) -> None:
     K = INTRINSICS
     camera = CameraIntrinsics(
         width=larger * K.width, height=larger * K.height, fx=larger * K.fx, fy=larger * K.fy,
         cx=larger * (K.cx + 0.5) - 0.5, cy=larger * (K.cy + 0.5) - 0.5, distortion=K.distortion,
     )  # fmt: skip
-    store = begun(folder, camera, name="boxes", unit_m=DEPTH_UNIT_M)
+    store = begun(folder / "boxes", camera, name="boxes", unit_m=DEPTH_UNIT_M)
     table = PlacedMesh(-1, box((1.0, 1.0, 0.02), RED), se3.from_translation([0.5, 0.0, -0.01]))
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, table])
@@ -104,3 +99,4 @@ def _make(folder: Path, larger: int) -> None:
         save_grasps(store, grasp_set(placed_object.obj_id, placed_object.instance))
     save_models(store.folder / "models", MODELS)
     store.close()
+    return store.folder

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bop_scenes import png
+from bop_scenes import mm, png
 from file_trees import bytes_of
 from plain_meshes import square
 from realsim.arrays import Array, UInt8
@@ -59,17 +59,15 @@ def bop_scene(folder: Path, *, turn: float = 0.0, views: int = 1, off_m: float =
         png(folder / f"rgb/{index:06d}.png", grey_of(labels))
         png(folder / f"depth/{index:06d}.png", np.round(labels.depth_m * 1e4).astype(np.uint16))
         T_cam_world = se3.invert(T)
+        R, t = mm(T_cam_world)
         scene_camera[str(index)] = {
             "cam_K": CAMERA.K.ravel().tolist(), "depth_scale": 0.1,
-            "cam_R_w2c": T_cam_world[:3, :3].ravel().tolist(),
-            "cam_t_w2c": (1e3 * T_cam_world[:3, 3]).tolist(),
+            "cam_R_w2c": R, "cam_t_w2c": t,
         }  # fmt: skip
         rows = []
         for m, p in enumerate(placed):
-            T_cam_obj = T_cam_world @ p.T_world_obj
-            t = 1e3 * (T_cam_obj[:3, 3] + [off_m, 0, 0])
-            R = T_cam_obj[:3, :3].ravel().tolist()
-            rows.append({"obj_id": part(NAMES[m]).obj_id, "cam_R_m2c": R, "cam_t_m2c": t.tolist()})
+            R, t = mm(se3.from_translation([off_m, 0, 0]) @ T_cam_world @ p.T_world_obj)
+            rows.append({"obj_id": part(NAMES[m]).obj_id, "cam_R_m2c": R, "cam_t_m2c": t})
             for kind, mask in (("mask", labels.amodal[m]), ("mask_visib", labels.visible(m))):
                 png(folder / f"{kind}/{index:06d}_{m:06d}.png", 255 * mask.astype(np.uint8))
         scene_gt[str(index)] = rows
