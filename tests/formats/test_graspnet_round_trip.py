@@ -334,13 +334,9 @@ def test_a_meta_file_with_a_mirrored_pose_is_refused(root):
 def test_one_frame_on_its_own_is_read_and_its_depth_is_checked(root, tmp_path):
     folder = tmp_path / "one"
     folder.mkdir()
-    names = {
-        "rgb/0000.png": "color.png",
-        "depth/0000.png": "depth.png",
-        "meta/0000.mat": "meta.mat",
-    }
-    for file, name in names.items():
-        shutil.copy(home(root) / file, folder / name)
+    for kind, name in (("rgb", "color.png"), ("depth", "depth.png")):
+        shutil.copy(home(root) / kind / "0000.png", folder / name)
+    shutil.copy(home(root) / "meta/0000.mat", folder / "meta.mat")
     scene = open_graspnet_frame(folder, models=root / "models")
     tree = opened(root)
     assert [o.obj_id for o in scene.frame(0).objects] == [1, 7, 30] and scene.indices == (0,)

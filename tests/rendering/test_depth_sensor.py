@@ -129,12 +129,6 @@ def test_surfaces_seen_edge_on_are_lost() -> None:
     assert share(87.5) > 0.9
 
 
-def test_mistakes_are_named() -> None:
-    refused("millimetres", DepthSensorModel, baseline_m=18.0)
-    rng = np.random.default_rng(0)
-    refused("the camera 320x240", EXACT.measure, np.ones((10, 10)), CAMERA, rng)
-
-
 # --- The default depth camera gives the bytes it has always given, and loads what it writes.
 
 SMALL_CAMERA = CameraIntrinsics(width=160, height=120, fx=160, fy=160, cx=79.5, cy=59.5)
@@ -196,10 +190,13 @@ def test_a_wrong_file_is_named(text: str, said: str, tmp_path: Path) -> None:
     refused(said, DepthSensorModel.load, path)
 
 
-def test_wrong_fields_and_profiles_are_named() -> None:
+def test_wrong_fields_profiles_and_images_are_named() -> None:
     refused("there is no depth camera 'd999'", DepthSensorModel.from_profile, "d999")
     refused("has no 'noise'", DepthSensorModel.from_profile, "d405", noise=1.0)
-    refused("millimetres", DepthSensorModel, depth_unit_m=1.0)
+    for wrong in ({"depth_unit_m": 1.0}, {"baseline_m": 18.0}):
+        refused("millimetres", DepthSensorModel, **wrong)
+    rng = np.random.default_rng(0)
+    refused("the camera 320x240", EXACT.measure, np.ones((10, 10)), CAMERA, rng)
 
 
 # --- fits: what a sensor was is what its pictures of a plane say, or say they cannot -------------
@@ -242,11 +239,7 @@ def test_parameters_are_recovered_within_their_uncertainty() -> None:
         assert estimate.uncertainty <= max(0.15 * true, 0.3 if name == "correlation_px" else 0.04)
     law = fit.estimates["distance_exponent"]
     assert law.determined and abs(law.value - 2) <= 3 * law.uncertainty < 0.3
-
-
-def test_holes_without_cause_are_counted() -> None:
-    fit = fitted(SOFT)
-    for name in ("blobs_per_megapixel", "blob_radius_px"):
+    for name in ("blobs_per_megapixel", "blob_radius_px"):  # holes without cause
         estimate = fit.estimates[name]
         assert abs(estimate.value - getattr(SOFT, name)) <= 3 * estimate.uncertainty
 
