@@ -17,7 +17,7 @@ from bop_scenes import edit, write_boxes
 from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import MaskOverlap, Tally, agreement_of, checked_scenes
-from realsim.errors import InputError
+from refusals import refused
 from typed_commands import complained, finished, invoked
 from upgradable_datasets import bop_dataset, graspnet_dataset
 
@@ -256,5 +256,4 @@ def test_a_list_that_is_none_or_leads_out_is_refused(tmp_path: Path, line: str) 
     (summed(tmp_path) / "SHA256SUMS").open("a").write(line + "\n")
     path = checksum_list(tmp_path)
     assert path is not None
-    with pytest.raises(InputError, match="line 2 of"):
-        check_checksums(path, tmp_path)
+    refused("line 2 of", check_checksums, path, tmp_path)

@@ -6,7 +6,7 @@ from itertools import pairwise, permutations, product
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5, find_arm
 from realsim_capture_plans.collision.model import CollisionModel, interpolate
@@ -20,6 +20,7 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.tour_search import held_karp_bound, two_nearest_bound
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import golden_cap, hemisphere_poses, reachable
+from refusals import refused
 
 CENTER = np.array([0.375, 0.0, 0.05])
 BOARD = np.array([0.375, 0.0, 0.0])
@@ -155,8 +156,7 @@ def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
     rng, small = np.random.default_rng(0), find_arm("ur3e").chain
     with pytest.raises(DegenerateError, match=says):
         hemisphere_plan(24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), rng, chain=small)
-    with pytest.raises(InputError, match="millimetres"):
-        PlanConfig(radius_m=(280.0, 420.0))
+    refused("millimetres", PlanConfig, radius_m=(280.0, 420.0))
 
 
 def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> None:

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError
 from realsim.geometry import parts_solids as solids
 from realsim.geometry import se3
 from realsim.geometry.distance_field import raycasting_scene
 from realsim.geometry.mesh import mass_properties, sample_surface
 from realsim.geometry.parts import part, part_names
-from refusals import refused
+from refusals import refused, undetermined
 
 NAMES = part_names()
 GENUS = {"hex_nut": 1, "gear": 1, "tube": 1, "mug": 1, "pulley": 1, "elbow": 1, "flange": 7}
@@ -173,5 +172,4 @@ def test_rings_the_wrong_way_round_and_open_surfaces_are_refused():
     square = solids.rectangle(0.02, 0.02)
     refused("clockwise", solids.triangulate, square[::-1])
     refused("axis", solids.revolve, [[0.01, 0], [0.02, 0.01]])
-    with pytest.raises(DegenerateError, match="no partner"):
-        solids.weld([solids.wall(square, 0, square, 0.01)])
+    undetermined("no partner", solids.weld, [solids.wall(square, 0, square, 0.01)])
