@@ -1,8 +1,19 @@
-"""Files of a session that claim what cannot be: an error names file and value."""
+"""Files of a session that claim what cannot be: an error names file and value.
 
+A command that was ended in the middle, run again, ends like one left alone.
+
+Nothing in the product runs what a file or a user says: no pickle, eval, shell or unsafe YAML.
+"""
+
+import ast
+import importlib
 import io
+import json
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -103,3 +114,83 @@ def test_what_a_grasp_set_claims_is_there(array: str, session: Path) -> None:
     with_claim(file, array, (10**11, 4, 4))
     assert str(file) in refusals.refused("100000000000x4x4", load_grasps, session)
     refused("stats", session)
+
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+kills: Any = importlib.import_module("reliability_kills")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kills")
+    kills.make_inputs(root / "work")
+    return root
+
+
+@pytest.fixture(scope="module", params=["annotate", "export", "stats"])
+def command(request: pytest.FixtureRequest, root: Path) -> Any:
+    return kills.Command(root, kills.LONG[request.param])
+
+
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
+def test_a_killed_command_ends_like_one_left_alone(command: Any, how: int) -> None:
+    caught, much = False, command.seconds
+    while not caught:  # the machine may be faster now than when the time was taken
+        much /= 2
+        caught, differs = command.ended(how, much)
+        assert differs == []
+
+
+@pytest.mark.parametrize("room", [2_000, pytest.param(9_000, marks=pytest.mark.slow)])
+def test_a_full_disk_is_told_and_the_same_command_goes_on(command: Any, room: int) -> None:
+    caught, differs = command.ended(kills.FULL, room)
+    assert caught and differs == []
+
+
+ROOT = Path(__file__).parents[2]
+PRODUCT = ("realsim", "calibration", "capture_plans", "sim_bridge")
+
+
+def broken_rules(*paths: Path | str) -> set[tuple[str, str]]:
+    """Return (rule, file) of what pyproject.toml's S rules find, told off in a comment or not."""
+    how = ["--config", "pyproject.toml", "--ignore-noqa", "--no-cache", "--output-format", "json"]
+    command = [sys.executable, "-m", "ruff", "check", *how, *paths]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    found = json.loads(done.stdout)
+    return {(f["code"], f["filename"]) for f in found if str(f["code"]).startswith("S")}
+
+
+def allowing_pickles(path: Path) -> bool:
+    """Return whether a file lets numpy unpickle, or leaves it to a variable."""
+    if "allow_pickle" not in (text := path.read_text()):
+        return False
+    words = [k for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call)
+             for k in n.keywords if k.arg == "allow_pickle"]  # fmt: skip
+    return any(not isinstance(k.value, ast.Constant) or k.value.value for k in words)
+
+
+def test_the_product_runs_nothing_that_a_file_brings() -> None:
+    assert not broken_rules(*PRODUCT)
+    files = [p for room in PRODUCT for p in (ROOT / room).rglob("*.py")]
+    assert len(files) > 500 and not [p for p in files if allowing_pickles(p)]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["import pickle; pickle.loads(b'')", "eval(input())", "exec('1')",
+     "import os; os.system(input())", "import subprocess as s; s.run(input(), shell=True)",
+     "import yaml; yaml.load('', yaml.Loader)"],
+)  # fmt: skip
+def test_each_rule_is_alive(line: str, tmp_path: Path) -> None:
+    (tmp_path / "a.py").write_text(line + "  # noqa\n")
+    assert broken_rules(tmp_path)
+
+
+def test_a_pickled_array_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "a.py"
+    for value, expected in (("True", True), ("False", False), ("given", True)):
+        path.write_text(f"np.load(path, allow_pickle={value})")
+        assert allowing_pickles(path) == expected
