@@ -44,7 +44,7 @@ from realsim.geometry import se3
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.results import CamerasReport
-from realsim_calibration.fit.board_pose import planar_poses
+from realsim_calibration.fit.view_system import planar_poses
 
 PACKAGES = ("realsim", "numpy", "scipy", "numba", "opencv-python-headless")
 VIEWS, HELD_OUT = 25, 15

@@ -138,7 +138,7 @@ def read_session(folder: Path) -> Any:
 def make_graspnet(folder: Path) -> None:
     """Write a GraspNet tree of one scene from rendered images."""
     from realsim import images
-    from realsim.formats.graspnet.meta import meta_bytes
+    from realsim.formats.graspnet.image_objects import meta_bytes
     from realsim.geometry import se3
     from realsim.geometry.mesh_files import ply_bytes
     from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -199,7 +199,7 @@ def _annotation(numbers: list[int], Ts: list[Any]) -> str:
 def read_graspnet(folder: Path) -> Any:
     """Read a GraspNet tree as a labelled scene."""
     from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.tree import open_graspnet
+    from realsim.formats.graspnet.scene import open_graspnet
 
     return [drain_scene(open_scene(ref)) for ref in open_graspnet(folder).scenes]
 

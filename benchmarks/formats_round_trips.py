@@ -28,7 +28,7 @@ from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import object_fields, pose_of, read_objects
 from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
-from realsim.formats.graspnet.meta import read_meta
+from realsim.formats.graspnet.image_objects import read_meta
 from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.geometry import se3
 from realsim.records import GraspSet

@@ -16,9 +16,8 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.loss import cosine_of_view
+from realsim.rendering.depth_sensors.loss import cosine_of_view, require_same_size, shadow_mask
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.rendering.depth_sensors.shadow import require_same_size, shadow_mask
 from realsim.rendering.rays import BACKGROUND, RayScene
 
 LARGEST_LOSS = 0.95

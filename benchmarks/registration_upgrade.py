@@ -38,7 +38,7 @@ from realsim.geometry.camera import ray_table
 from realsim.geometry.mesh_files import load_mesh
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.photo import Picture, outline_of, shifted

@@ -12,7 +12,7 @@ from reliability_log import Log
 def make_results(folder: Path) -> None:
     """Write a session with calibration, board, scene, grasps and what the arm did."""
     from realsim.records import HandEye, Scene, TagBoard
-    from realsim.records.trajectories import GraspTrajectories
+    from realsim.records.grasps import GraspTrajectories
     from realsim.store import results, trajectories
     from registered_sessions import CAMERA, table_session, true_poses
     from reviewed_boxes import grasp_set

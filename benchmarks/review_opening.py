@@ -35,7 +35,7 @@ CLICK_QUIET_S = 0.3
 IMPORTS = (
     "import trimesh, scipy.spatial, cv2, isal.isal_zlib, viser, realsim.review, "
     "realsim.review.window.window, realsim.review.content.content, "
-    "realsim.review.drawing.scene_nodes, realsim.models.mesh_clustering, realsim.registration, "
+    "realsim.review.drawing.scene_nodes, realsim.models.simplify, realsim.registration, "
     "numba, sys, pathlib; "
     "from realsim.review.content import quick_png; "
     "quick_png.read_rgb(pathlib.Path(sys.argv[1]) / 'rgb/000000.png'); "

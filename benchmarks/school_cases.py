@@ -25,15 +25,15 @@ from school_shapes import SHAPES
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.models.convex import ConvexConfig, convex_parts
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.models.properties import physical_properties
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.registration.simulated import TableLabConfig, scatter_objects
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.object_task import ObjectTask, prepare, trial_of
 from realsim_sim_bridge.school.school import object_tasks
+from realsim_sim_bridge.school.shards import stand_of
 from realsim_sim_bridge.slip.engines import settings_of
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody

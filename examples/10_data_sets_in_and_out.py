@@ -12,7 +12,7 @@ from realsim.formats.bop.root_files import write_bop_models
 from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
-from realsim.formats.graspnet.tree import open_graspnet
+from realsim.formats.graspnet.scene import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3

@@ -11,7 +11,6 @@ from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
-from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import (
     CLOSED_FORMS,
     check_observable,
@@ -20,6 +19,7 @@ from realsim_calibration.fit.closed_forms import (
     shah,
 )
 from realsim_calibration.fit.joint_solve import JointConfig
+from realsim_calibration.fit.view_system import BoardPose, estimate_board_pose
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
     calibrate_hand_eye,

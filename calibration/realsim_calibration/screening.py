@@ -20,9 +20,9 @@ from realsim_calibration.faults.gates import (
     screw_ratio,
 )
 from realsim_calibration.faults.motion_check import roll_range_deg
-from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MIN_VIEWS, check_observable
 from realsim_calibration.fit.joint_solve import JointConfig
+from realsim_calibration.fit.view_system import BoardPose, estimate_board_pose
 from realsim_calibration.results import Mode
 from realsim_calibration.views import BoardView, TargetDetection
 

@@ -81,7 +81,7 @@ QUIET_KEY = "realsim.quiet"
 @click.pass_context
 def commands(ctx: click.Context, config_file: Path | None, no_color: bool) -> None:
     """Turn robot captures into grasping data that you can trust."""
-    from realsim.app.config.applied import apply_config
+    from realsim.app.config.settings import apply_config
 
     apply_config(ctx, config_file, quiet=bool(ctx.meta.get(QUIET_KEY)))
 

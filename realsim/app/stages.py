@@ -187,7 +187,7 @@ def session_models(store: SessionStore, console: Console | None = None) -> dict[
     """
     from realsim.app.reviewed import review_of
     from realsim.formats.bop.models import load_models
-    from realsim.review.symmetric import marked_models
+    from realsim.review.corrections import marked_models
 
     notes: list[str] = []
     models = marked_models(load_models(store.folder / "models", notes=notes), review_of(store))

@@ -4,6 +4,8 @@ Inside is negative. The distance is exact at the grid's nodes near the surface a
 between them; the gradient is that of the interpolated value, so that value and derivative agree,
 as a least-squares solver needs. Outside the grid the field goes on as the value at the nearest
 point of the box plus the distance to it: an upper bound that points the right way.
+
+How often a surface winds about a point.
 """
 
 import contextlib
@@ -17,15 +19,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Array32, Int64, Mask
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry.mesh_shape import is_closed, welded
 from realsim.geometry.point_loops import move
-from realsim.geometry.winding import solid_angle_share
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 from realsim.untrusted.arrays import read_npz
+
+
+@njit
+def solid_angle_share(points: Array, faces: Int64 | Int32) -> float:
+    """Return the share of the sphere about the origin that the faces fill: 1 inside, 0 outside.
+
+    The sum of signed solid angles (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 1983), which
+    for a closed mesh is its winding number.
+    """
+    total = 0.0
+    for f in range(len(faces)):
+        a, b, c = points[faces[f, 0]], points[faces[f, 1]], points[faces[f, 2]]
+        la, lb, lc = np.sqrt(np.sum(a * a)), np.sqrt(np.sum(b * b)), np.sqrt(np.sum(c * c))
+        volume = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
+        )
+        ab, bc, ca = np.sum(a * b), np.sum(b * c), np.sum(c * a)
+        total += np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return total / (2.0 * np.pi)
+
 
 MARGIN_CELLS = 6
 """Cells around the bounding box in which the field is interpolated, not extended."""

@@ -47,7 +47,7 @@ from realsim.many.pool import (
 )
 from realsim.many.ray_driver import Opening, require_address
 from realsim.many.ray_node import Ended
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 
 OPEN_S = 120.0
 """Longest wait until the cluster is there [s]."""

@@ -15,11 +15,10 @@ from realsim.formats.bop.models import INFO_FILE, info_of, model_files
 from realsim.geometry.mesh import mass_properties, ply_bytes
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj
-from realsim.models.library_commit import commit, only_writer_of
-from realsim.models.library_files import read_info, require_name, sha256
+from realsim.models.library_files import commit, only_writer_of, read_info, require_name, sha256
 from realsim.models.library_prepare import Matter, PrepareConfig, PreparedModel, prepare_mesh
 from realsim.models.library_reading import LibraryReader
-from realsim.models.library_records import LibraryModel, ScaleNote, UnscaledModel
+from realsim.models.model_records import LibraryModel, ScaleNote, UnscaledModel
 from realsim.records import ObjectModel
 from realsim.store import atomic
 

@@ -6,11 +6,10 @@ from dataclasses import asdict, replace
 from realsim.formats.bop.models import model_file
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj
-from realsim.models.library_commit import commit, only_writer_of
-from realsim.models.library_files import sha256
+from realsim.models.library_files import commit, only_writer_of, sha256
 from realsim.models.library_prepare import Matter, PrepareConfig, Step, prepare_as_it_is
 from realsim.models.library_reading import LibraryReader
-from realsim.models.library_records import LibraryModel
+from realsim.models.model_records import LibraryModel
 from realsim.models.pictures import sheet_png
 
 COMPLETE_STEPS: tuple[Step, ...] = ("symmetries", "convex parts", "properties")

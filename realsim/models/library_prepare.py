@@ -15,13 +15,16 @@ from realsim import __version__
 from realsim.errors import DegenerateError, InputError
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.inspect import inspect_mesh
-from realsim.models.library_records import ConvexNote, ModelProperties, ScaleNote, ScanSource
 from realsim.models.model_records import (
+    ConvexNote,
     ConvexParts,
     MeshReport,
+    ModelProperties,
     Problem,
     ReadScan,
     Repair,
+    ScaleNote,
+    ScanSource,
     Symmetries,
 )
 from realsim.models.properties import physical_properties

@@ -12,10 +12,9 @@ from typing import Any
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE, model_file
 from realsim.models import library_files as files
-from realsim.models.library_commit import commit, only_writer_of
-from realsim.models.library_files import read_info
+from realsim.models.library_files import commit, only_writer_of, read_info
 from realsim.models.library_reading import LibraryReader
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.store import atomic
 
 

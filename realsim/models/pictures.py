@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Image
-from realsim.models.library_records import ModelProperties
 from realsim.models.model_picture_views import (
     INK,
     MUTED,
@@ -29,7 +28,7 @@ from realsim.models.model_picture_views import (
     symmetry_layers,
     view_of,
 )
-from realsim.models.model_records import ConvexParts
+from realsim.models.model_records import ConvexParts, ModelProperties
 from realsim.records import Mesh
 
 VIEWS: tuple[tuple[str, tuple[float, float, float]], ...] = (

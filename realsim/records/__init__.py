@@ -6,7 +6,7 @@ here, at construction. All units are SI (m, rad, s, kg, N) unless the name says 
 
 from realsim.records.calibration import ArmErrorMap, Check, HandEye, RobotErrorMap
 from realsim.records.capture import DISTORTION_TERMS, CameraIntrinsics, CaptureSession, View
-from realsim.records.grasps import MEASURES, STAGES, GraspSet, Measure
+from realsim.records.grasps import MEASURES, PHASES, STAGES, GraspSet, GraspTrajectories, Measure
 from realsim.records.objects import (
     Mesh,
     ObjectModel,
@@ -24,7 +24,6 @@ from realsim.records.targets import (
     TagBoard,
     Target,
 )
-from realsim.records.trajectories import PHASES, GraspTrajectories
 
 __all__ = [
     "DISTORTION_TERMS",

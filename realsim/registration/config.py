@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.blind import CovarianceConfig
 from realsim.registration.evidence import EvidenceConfig
 from realsim.registration.refinement.config import RefineConfig

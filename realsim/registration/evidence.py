@@ -12,7 +12,7 @@ from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
 from realsim.geometry.depth import check_depth, depth_noise_per_m, edge_mask, points_from_depth
 from realsim.records import CameraIntrinsics, SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.body import Body
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration import near_start
 from realsim.registration.blind import Kept, keep_start
 from realsim.registration.body import Body, moved_body

@@ -18,8 +18,7 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.few_views import begin, search_near
 from realsim.registration.hint_regions import RoughPose, region_about
 from realsim.registration.intake import Intake
-from realsim.registration.judging.scene_checks import SceneFinding, with_swaps
-from realsim.registration.judging.unit_checks import unit_errors
+from realsim.registration.judging.scene_checks import SceneFinding, unit_errors, with_swaps
 from realsim.registration.many_views import ManyViews
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.refinement.refine import area_at

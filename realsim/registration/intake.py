@@ -10,19 +10,21 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.depth import check_depth
 from realsim.records import CameraIntrinsics, SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration import evidence
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.find_table import find_table, looked_at
-from realsim.registration.fixed_cameras import FixedFrames, noise_of, still_depth
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.view_agreement import ViewFinding
 from realsim.registration.view_checks import check_views
 from realsim.registration.views import (
+    FixedFrames,
     SampleConfig,
     ViewPoints,
+    noise_of,
     sample_view,
     sample_views,
+    still_depth,
     world_cloud,
 )
 

@@ -8,7 +8,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration import evidence
 from realsim.registration.blind import Kept, blind_motions, keep_start, nearest_to_start
 from realsim.registration.body import Body

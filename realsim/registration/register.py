@@ -26,7 +26,6 @@ from realsim.registration.compare import spread_frames
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import few_around, register_few, with_photograph
-from realsim.registration.fixed_cameras import FixedFrames
 from realsim.registration.intake import check_odometry, take_in, without_fixed
 from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
@@ -44,7 +43,7 @@ from realsim.registration.registered import (
 from realsim.registration.rivals_around import Around, integrated
 from realsim.registration.search.records import NotPlaced, Wanted
 from realsim.registration.top_down import not_seen, top_down_poses
-from realsim.registration.views import ViewPoints
+from realsim.registration.views import FixedFrames, ViewPoints
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
 

@@ -16,7 +16,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import SupportPlane
-from realsim.registration import held_views
+from realsim.registration import view_agreement
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import ViewTable, view_table
@@ -102,8 +102,8 @@ def check_views(
     gone = {f.index for f in found if f.exclude}
     left = [v for v in views if v.index not in gone]
     if len(left) > 1:
-        held = held_views.hold_views(left, plane, noise)
-        wrong = held_views.check_all_poses(held, plane)
+        held = view_agreement.hold_views(left, plane, noise)
+        wrong = view_agreement.check_all_poses(held, plane)
         if not wrong and plane is not None:
             wrong = _check_each(held, plane, noise)
         found += wrong
@@ -139,7 +139,7 @@ def _check_amounts(views: Sequence[ViewPoints]) -> list[ViewFinding]:
 
 
 def _check_each(
-    held: held_views.HeldViews, plane: SupportPlane, noise: DepthNoise
+    held: view_agreement.HeldViews, plane: SupportPlane, noise: DepthNoise
 ) -> list[ViewFinding]:
     """Return the views that are not where the others are, or show another scene."""
     n = len(held.views)
@@ -160,7 +160,7 @@ def _check_each(
     return _with_slip(held, found, odd)
 
 
-def _odd_views(held: held_views.HeldViews, offs: dict[int, str]) -> list[_Odd]:
+def _odd_views(held: view_agreement.HeldViews, offs: dict[int, str]) -> list[_Odd]:
     """Return the views that disagree with the sound ones.
 
     A few wrong views spoil the partners of sound ones: the odd views of one round are nobody's
@@ -171,7 +171,7 @@ def _odd_views(held: held_views.HeldViews, offs: dict[int, str]) -> list[_Odd]:
     shares = np.zeros(n)
     for round_ in range(ROUNDS):
         shares = np.array([
-            held_views.contradiction(held, k, _sound_partners(held, k, bad)) for k in range(n)
+            view_agreement.contradiction(held, k, _sound_partners(held, k, bad)) for k in range(n)
         ])  # fmt: skip
         usual, spread = _middle(shares.tolist())
         limit = max(PARTLY_SHARE, usual + SPREADS * spread)
@@ -186,7 +186,7 @@ def _odd_views(held: held_views.HeldViews, offs: dict[int, str]) -> list[_Odd]:
     return [_Odd(k=k, share=float(shares[k]), off=offs.get(k, "")) for k in sorted(bad)]
 
 
-def _sound_partners(held: held_views.HeldViews, k: int, bad: set[int]) -> Sequence[int]:
+def _sound_partners(held: view_agreement.HeldViews, k: int, bad: set[int]) -> Sequence[int]:
     """Return the partners of view k that are not bad, topped up with the nearest sound views."""
     mine = [int(j) for j in held.partners[k]]
     sound = [j for j in mine if j not in bad]
@@ -198,7 +198,7 @@ def _sound_partners(held: held_views.HeldViews, k: int, bad: set[int]) -> Sequen
     return sound + more[: len(mine) - len(sound)]
 
 
-def _tables_off(held: held_views.HeldViews, tables: Sequence[ViewTable]) -> dict[int, str]:
+def _tables_off(held: view_agreement.HeldViews, tables: Sequence[ViewTable]) -> dict[int, str]:
     """Return in words, per view, how its table lies against the others', if it lies wrong.
 
     A lid of a large box is higher than the table, too; but nobody looks through it.
@@ -218,7 +218,7 @@ def _tables_off(held: held_views.HeldViews, tables: Sequence[ViewTable]) -> dict
         if abs(up) <= most_height and t.tilt_deg <= most_tilt:
             continue
         shift = max(abs(up), LEVER_M * float(np.tan(np.radians(t.tilt_deg))))
-        if held_views.sheet_contradiction(held, k, 0.5 * shift) > PARTLY_SHARE:
+        if view_agreement.sheet_contradiction(held, k, 0.5 * shift) > PARTLY_SHARE:
             off[k] = (
                 f"it sees the table {1e3 * abs(up):.0f} mm {'above' if up > 0 else 'below'} and "
                 f"{t.tilt_deg:.1f} deg tilted against where the others see it"
@@ -227,7 +227,7 @@ def _tables_off(held: held_views.HeldViews, tables: Sequence[ViewTable]) -> dict
 
 
 def _finding(
-    held: held_views.HeldViews,
+    held: view_agreement.HeldViews,
     odd: _Odd,
     all_odd: Sequence[_Odd],
     table: tuple[SupportPlane, DepthNoise],
@@ -269,7 +269,7 @@ def _finding(
 
 
 def _pose_of(
-    held: held_views.HeldViews,
+    held: view_agreement.HeldViews,
     odd: _Odd,
     all_odd: Sequence[_Odd],
     table: tuple[SupportPlane, DepthNoise],
@@ -279,16 +279,16 @@ def _pose_of(
     sound = [k for k in range(len(held.views)) if k not in bad]
     Ts = held.maps.Ts_world_cam
     eyes = Ts[sound, :3, 3]
-    best, best_support = None, held_views.SCENE_SUPPORT
+    best, best_support = None, view_agreement.SCENE_SUPPORT
     for u in range(len(held.views)):
         if u == odd.k:
             continue
         order = np.argsort(np.linalg.norm(eyes - Ts[u, :3, 3], axis=1), kind="stable")
-        near = [sound[int(i)] for i in order if sound[int(i)] != u][: held_views.NEAR + 1]
-        gain = held_views.support(held, odd.k, near, Ts[u])
+        near = [sound[int(i)] for i in order if sound[int(i)] != u][: view_agreement.NEAR + 1]
+        gain = view_agreement.support(held, odd.k, near, Ts[u])
         if gain <= best_support:
             continue
-        rest = held_views.contradiction(held, odd.k, near, Ts[u])
+        rest = view_agreement.contradiction(held, odd.k, near, Ts[u])
         moved = view_table(replace(held.views[odd.k], T_world_cam=Ts[u]), table[0], table[1])
         flat = moved.share > TABLE_KEPT * moved.own_share
         before = max(odd.share, PARTLY_SHARE)
@@ -298,7 +298,7 @@ def _pose_of(
 
 
 def _with_slip(
-    held: held_views.HeldViews, found: Sequence[ViewFinding], odd: Sequence[_Odd]
+    held: view_agreement.HeldViews, found: Sequence[ViewFinding], odd: Sequence[_Odd]
 ) -> list[ViewFinding]:
     """Return the findings; a run of displaced views up to the last is a mount that slipped."""
     first, n = odd[0].k, len(held.views)
@@ -355,12 +355,14 @@ def _unexplained(
     view: ViewPoints, plane: SupportPlane, noise: DepthNoise, placed: Sequence[tuple[Body, Array]]
 ) -> float | None:
     """Return the share of a view's points around the objects that lie on none; None = too few."""
-    rng = np.random.default_rng((held_views.SEED, view.index))
-    few = view.points[rng.integers(0, len(view.points), 4 * held_views.POINTS)].astype(np.float64)
+    rng = np.random.default_rng((view_agreement.SEED, view.index))
+    few = view.points[rng.integers(0, len(view.points), 4 * view_agreement.POINTS)].astype(
+        np.float64
+    )
     p = se3.transform(view.T_world_cam, few)
     height = se3.transform(se3.invert(plane.T_world_table), p)[:, 2]
     sigma = noise.sigma(few[:, 2])
-    above = height > held_views.ABOVE_M + held_views.SIGMAS * sigma
+    above = height > view_agreement.ABOVE_M + view_agreement.SIGMAS * sigma
     nearest = np.full(len(p), np.inf)
     around = np.zeros(len(p), dtype=bool)
     for body, T in placed:
@@ -370,9 +372,9 @@ def _unexplained(
         gap = np.abs(body.field.distance(p[some], se3.invert(T)))
         nearest[some] = np.minimum(nearest[some], gap)
     mine = around & above
-    if np.count_nonzero(mine) < held_views.LEAST_DECIDED:
+    if np.count_nonzero(mine) < view_agreement.LEAST_DECIDED:
         return None
-    return float(np.mean(nearest[mine] > OBJECT_REACH_M + held_views.SIGMAS * sigma[mine]))
+    return float(np.mean(nearest[mine] > OBJECT_REACH_M + view_agreement.SIGMAS * sigma[mine]))
 
 
 def _middle(values: Sequence[float]) -> tuple[float, float]:
@@ -382,7 +384,7 @@ def _middle(values: Sequence[float]) -> tuple[float, float]:
     return middle, float(MAD_TO_SIGMA * np.median(np.abs(x - middle)))
 
 
-def _listed(held: held_views.HeldViews, odd: Sequence[_Odd]) -> str:
+def _listed(held: view_agreement.HeldViews, odd: Sequence[_Odd]) -> str:
     """Return the numbers of views, the first dozen of them."""
     numbers = [str(held.views[o.k].index) for o in odd[:LISTED]]
     return ", ".join(numbers) + (" ..." if len(odd) > LISTED else "")

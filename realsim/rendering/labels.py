@@ -15,7 +15,7 @@ from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.casting import pixel_caster
-from realsim.rendering.casting.surface_maps import surface_maps
+from realsim.rendering.casting.pixel_caster import surface_maps
 from realsim.rendering.rays import BACKGROUND, HitBuffer, PlacedMesh, RayScene
 
 __all__ = ["HitBuffer", "LabelRenderer", "Labels", "PlacedMesh"]

@@ -260,7 +260,7 @@ class ReviewedSession:
         Raises:
             InputError: unsigned, or the text is not understood.
         """
-        from realsim.review.symmetric import symmetry_of
+        from realsim.review.corrections import symmetry_of
 
         symmetry_of(symmetry, self.model(obj_id).mesh)
         entry = journal.new_entry("symmetric", None, reviewer, obj_id=obj_id, symmetry=symmetry)
@@ -336,7 +336,7 @@ class ReviewedSession:
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return all models, symmetric as the reviewers marked them."""
-        from realsim.review.symmetric import marked_models
+        from realsim.review.corrections import marked_models
 
         return marked_models(self.content().models, self.standing.state)
 

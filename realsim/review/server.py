@@ -31,7 +31,7 @@ from realsim.review.journal import Entry
 from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.window import page_head, window_text
-from realsim.review.window.gui_values import is_camera
+from realsim.review.window.from_browser import is_camera
 from realsim.review.window.window import Window
 from realsim.store import SessionStore
 

@@ -16,13 +16,11 @@ from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
-from realsim.robots.dh_of_chain import dh_of_chain
-from realsim.robots.kinematics import DhChain
+from realsim.robots.kinematics import DhChain, dh_of_chain
 from realsim.robots.limits import JointLimits
-from realsim.robots.link_shapes import Block, Rod, block_shape, link_shape, rod_shape
 from realsim.robots.mjcf import read_mjcf_chain
 from realsim.robots.robot_files import FILE, RobotFile, RobotFolder, names_of, robot_file, same_name
-from realsim.robots.shapes import Shape
+from realsim.robots.shapes import Block, Rod, Shape, block_shape, link_shape, rod_shape
 from realsim.robots.urdf import UrdfChain, UrdfShape, read_chain
 from realsim.untrusted.own_json import OwnFile
 

@@ -10,8 +10,7 @@ from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.robots.check_arm import Finding
 from realsim.robots.hand import Hand, hand_of
-from realsim.robots.hand_file import HandFile
-from realsim.robots.robot_files import RobotFolder, robot_file
+from realsim.robots.robot_files import HandFile, RobotFolder, robot_file
 from realsim.robots.urdf import floats, mimicked, origin_of
 from realsim.untrusted.xml_tree import read_xml
 

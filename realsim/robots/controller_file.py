@@ -27,8 +27,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.robots.arm import ur_chains
-from realsim.robots.dh_of_chain import Screws, normals, screws
-from realsim.robots.kinematics import DhChain
+from realsim.robots.kinematics import DhChain, Screws, normals, screws
 from realsim.untrusted.files import checked_text
 
 LISTS = ("theta", "a", "d", "alpha")

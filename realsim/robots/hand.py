@@ -22,8 +22,14 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.hand_file import STIFFEST_N_PER_M, HandFile, Point, soft_n_per_m
-from realsim.robots.robot_files import RobotFolder, robot_file
+from realsim.robots.robot_files import (
+    STIFFEST_N_PER_M,
+    HandFile,
+    Point,
+    RobotFolder,
+    robot_file,
+    soft_n_per_m,
+)
 from realsim.untrusted.own_json import from_json
 
 Box = tuple[Point, Point]

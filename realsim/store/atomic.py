@@ -7,11 +7,14 @@ next call can never be there without it. What a killed process leaves behind is 
 that nobody reads; whoever owns the folder asks for `leftovers` and deletes them.
 
 A full disk is an OSError: the file, and the lines that were there, are as before the call.
+
+One run at a time in a folder.
 """
 
 import contextlib
 import csv
 import errno
+import fcntl
 import io
 import json
 import math
@@ -19,13 +22,14 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.errors import RealsimError
+from realsim.errors import InputError, RealsimError
 
 TEMPORARY_SUFFIX = ".part"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -252,3 +256,30 @@ def leftovers(folder: Path | str) -> list[tuple[Path, Path]]:
         if name and pid.isdecimal() and not _is_running(int(pid)):
             found.append((path, path.with_name(name)))
     return found
+
+
+@contextmanager
+def only_run_in(folder: Path) -> Generator[None]:
+    """Keep other runs out of a folder while this one works in it; a kill releases it.
+
+    The lock is on the folder itself, so that no file is left behind.
+
+    Raises:
+        InputError: another run is working there.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"another run is working in '{folder}'. Wait until it ends, stop it, or choose "
+                "another folder; two at once would mix their results."
+            ) from None
+        try:
+            yield
+        finally:
+            # By itself it would go on in processes that were forked meanwhile.
+            fcntl.flock(handle, fcntl.LOCK_UN)
+    finally:
+        os.close(handle)

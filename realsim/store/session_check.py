@@ -23,8 +23,7 @@ from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import entry_from, entry_of, fault_of, take
 from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, ROBOT_FILE
-from realsim.store.robot_lines import record_of
-from realsim.store.view_images import depth_path, rgb_path
+from realsim.store.view_files import depth_path, record_of, rgb_path
 from realsim.untrusted.own_json import from_json
 
 PLAN_FILE = "plan.json"

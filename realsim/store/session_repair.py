@@ -18,9 +18,8 @@ from realsim.store.header import SESSION_FILE, checked_header, new_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
 from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, RECOVERED, ROBOT_FILE, read_begun
-from realsim.store.robot_lines import CHECK, record_of
 from realsim.store.session_store import SessionStore
-from realsim.store.view_images import depth_path, rgb_path
+from realsim.store.view_files import CHECK, depth_path, record_of, rgb_path
 from realsim.untrusted.own_json import read_object
 
 LENS = ("camera", "depth_unit_m")

@@ -32,8 +32,14 @@ from realsim.store import atomic, opening
 from realsim.store.atomic import storing
 from realsim.store.header import SESSION_FILE, header_to_open, new_header
 from realsim.store.manifest import Fault, Manifest, entry_of
-from realsim.store.robot_lines import RobotLines, record_of
-from realsim.store.view_images import check_sizes, depth_path, is_whole, rgb_path
+from realsim.store.view_files import (
+    RobotLines,
+    check_sizes,
+    depth_path,
+    is_whole,
+    record_of,
+    rgb_path,
+)
 from realsim.untrusted.own_json import from_json, read_values, to_json
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.records import GraspSet
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import PHASES, GraspTrajectories
 from realsim.store import atomic
 from realsim.store.results import grasp_folder, grasp_stem, write_beside_grasps
 from realsim.store.session_store import SessionStore

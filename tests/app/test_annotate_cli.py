@@ -13,7 +13,7 @@ from realsim.app.annotate.page import PAGE_FILE
 from realsim.app.annotate.run import SHEET_FILE
 from realsim.geometry import se3
 from realsim.store import SessionStore, load_scene, save_scene
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from registered_sessions import models_of
 from shared_sessions import copy_of
 from typed_commands import finished, refused

@@ -19,7 +19,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, TagBoard, View
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.store import SessionStore
 from realsim.store.atomic import write_json
 from realsim.store.cameras import camera_folder

@@ -19,7 +19,7 @@ import pytest
 from realsim import app
 from realsim.app.cli import commands
 from realsim.app.command import context_of, settable, spelling, variable, walk
-from realsim.app.config import applied
+from realsim.app.config import settings
 from realsim.app.front import COMMANDS, GROUPS, help_text
 from realsim.app.meanings import MEANINGS, OLD_NAMES
 from realsim.app.options import two_meanings
@@ -286,7 +286,7 @@ def test_what_is_missing_ends_with_what_to_install_and_a_bug_with_its_place(
     def load(*_: object, **__: object) -> None:
         raise missing
 
-    monkeypatch.setattr(applied, "apply_config", load)
+    monkeypatch.setattr(settings, "apply_config", load)
     monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
     with pytest.raises(SystemExit if words else ModuleNotFoundError) as stop:
         app.main()

@@ -19,7 +19,7 @@ from realsim.geometry import se3
 from realsim.records import ObjectPose
 from realsim.store import SessionStore, load_scene
 from realsim.store.arrays_on_disk import is_whole, write_arrays
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from refusals import refused
 from registered_sessions import true_poses
 from shared_sessions import copy_of

@@ -23,7 +23,7 @@ from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import MaskOverlap, Tally, agreement_of, checked_scenes
 from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from refusals import refused
 from typed_commands import complained, finished, invoked, realsim
 from upgradable_datasets import bop_dataset, graspnet_dataset

@@ -20,8 +20,7 @@ import pytest
 from file_trees import bytes_of
 from realsim.app.cli import commands
 from realsim.app.console import Console, StageTime
-from realsim.app.demo.run import DemoResult, show_demo
-from realsim.app.demo.site import PAGES, write_site
+from realsim.app.demo.run import PAGES, DemoResult, show_demo, write_site
 from realsim.app.pipeline import chain
 from realsim.app.pipeline import run as pipeline_run
 from realsim.app.pipeline.campaign import read_campaign

@@ -10,7 +10,7 @@ from given_plans import plan_through
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim.robots.arm import UR5E
-from realsim_capture_plans.plan_files.exported import table_frame
+from realsim_capture_plans.plan_files.foreign_plans import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from typed_commands import complained, finished, realsim

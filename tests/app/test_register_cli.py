@@ -30,7 +30,7 @@ from realsim.formats.bop.models import save_models
 from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.odometry.hand_held import hand_held_poses
 from realsim.registration.views import SampleConfig
 from realsim.store import SessionStore

@@ -12,8 +12,8 @@ from realsim.app import stages
 from realsim.app.annotate import current
 from realsim.app.annotate.current import annotate_session, refresh_labels, what_is_stale
 from realsim.app.console import Console
-from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
+from realsim.app.export.target import ExportRequest
 from realsim.app.register.from_review import moved_since_accepted, review_starts, stayed
 from realsim.app.register.results import load_registered, with_objects
 from realsim.formats.bop.scene import find_scenes, read_scene

@@ -15,8 +15,8 @@ from realsim.app.register.files import write_result
 from realsim.app.report import compare
 from realsim.app.report.compare_page import as_json, comparison_of, comparison_page
 from realsim.app.report.figures import Figure, count
+from realsim.app.report.registering import registration_pairs
 from realsim.app.report.session import report_of, write_report
-from realsim.app.report.sliders import registration_pairs
 from realsim.app.report.sources import Source, read_stored, sources_of
 from realsim.app.stages import save_starts
 from realsim.errors import InputError

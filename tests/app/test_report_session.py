@@ -16,7 +16,7 @@ from begun_sessions import begun
 from page_tags import Tags
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
-from realsim.app.register.uncertainty import held, sigmas
+from realsim.app.register.results import held, sigmas
 from realsim.app.report.compare_page import comparison_of, comparison_page
 from realsim.app.report.figures import (
     Figure,

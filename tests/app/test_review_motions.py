@@ -11,7 +11,7 @@ from realsim.app.school.files import stored_grasps
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import ObjectModel
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm, home_joints
 from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations

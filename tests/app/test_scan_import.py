@@ -28,7 +28,7 @@ from realsim.images import png_bytes
 from realsim.models.convex_worker import ConvexConfig
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig
-from realsim.models.library_records import ScaleNote
+from realsim.models.model_records import ScaleNote
 from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
 from typed_commands import realsim

@@ -21,7 +21,7 @@ from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.geometry.parts import object_model
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
-from realsim.models.library_records import ScaleNote
+from realsim.models.model_records import ScaleNote
 from realsim.records import View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions
 from realsim.scanning.scale.measured import length_of, parse_measurement

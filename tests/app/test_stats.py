@@ -18,9 +18,8 @@ from labelled_scenes import SceneInMemory, labelled_scene, written_bop, written_
 from realsim import images
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
-from realsim.app.stats.collect import session_facts
 from realsim.app.stats.compare import diff_scenes
-from realsim.app.stats.statistics import all_rows, same_content, statistics_of
+from realsim.app.stats.statistics import all_rows, same_content, session_facts, statistics_of
 from realsim.formats.graspnet.grasp_labels import (
     GraspLabels,
     write_collision_labels,

@@ -17,7 +17,7 @@ import board_depth
 from page_tags import Tags
 from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, Check, HandEye
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.report import style
 from realsim_calibration.report.model_plots import lens_field

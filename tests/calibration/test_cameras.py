@@ -195,7 +195,7 @@ def test_the_step_is_that_of_all_unknowns_solved_at_once() -> None:
 
 
 def _boards_by(rig: Rig, camera: int) -> dict[int, Array]:
-    from realsim_calibration.fit.board_pose import estimate_board_pose
+    from realsim_calibration.fit.view_system import estimate_board_pose
 
     found: dict[int, Array] = {}
     for s in rig.of_camera(camera):

@@ -20,7 +20,7 @@ from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, undistort
 from realsim.records import CameraIntrinsics
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.results import BoardShape

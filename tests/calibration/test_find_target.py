@@ -12,11 +12,10 @@ from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import TAG_CELLS, Chessboard, CircleGrid
 from realsim_calibration.detect import tags
-from realsim_calibration.detect.drawings import COVERED, DRAWN, drawing_reason
 from realsim_calibration.detect.find import edge_blur_px, find_target
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
 from realsim_calibration.detect.tags import detect_tags
-from realsim_calibration.detect.visible import what_is_visible
+from realsim_calibration.detect.visible import COVERED, DRAWN, drawing_reason, what_is_visible
 from refusals import refused
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import real_data
-from realsim.app.calibrate.images import require_target
+from realsim.app.calibrate.board_views import require_target
 from realsim.records.targets import CharucoBoard, CircleGrid
-from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import fit_homography, seen_from_front
+from realsim_calibration.detect.visible import DRAWN
 from refusals import refused
 
 DATA = real_data.DATA / "handeye"

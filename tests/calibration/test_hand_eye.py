@@ -8,8 +8,8 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_calibration import CLOSED_FORMS, HandEyeConfig, JointConfig, check_observable, park
 from realsim_calibration.checks import own_lens_check
-from realsim_calibration.detect.drawings import DRAWN
-from realsim_calibration.fit.board_pose import estimate_board_pose
+from realsim_calibration.detect.visible import DRAWN
+from realsim_calibration.fit.view_system import estimate_board_pose
 from realsim_calibration.hand_eye import calibrate_hand_eye, calibrate_hand_eye_report
 from realsim_calibration.views import BoardView
 from refusals import refused, undetermined

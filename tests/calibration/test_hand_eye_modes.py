@@ -26,8 +26,7 @@ from realsim_calibration.exports.calibration_file import calibration_text, read_
 from realsim_calibration.exports.frames import FrameNames, note_lines
 from realsim_calibration.exports.write import write_exports
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS
-from realsim_calibration.fit.effective import places_of
-from realsim_calibration.fit.linear_model import LinearModel
+from realsim_calibration.fit.linear_model import LinearModel, places_of
 from realsim_calibration.fit.robot_error import matching_arm, pose_features
 from realsim_calibration.fit.robust_fit import Solution, at_least, solve
 from realsim_calibration.hand_eye import choose_plain, setup_of

@@ -29,7 +29,7 @@ from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.run import CaptureJob, CaptureSummary
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, DeviceError, Frame
-from realsim_capture_plans.plan_files.imported import colliding_legs
+from realsim_capture_plans.plan_files.foreign_plans import colliding_legs
 from realsim_capture_plans.plan_files.plan_json import load_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from refusals import refused

@@ -12,8 +12,7 @@ from realsim.interop import import_pinocchio
 from realsim.robots.arm import UR5, UR5E, arm_of, find_arm
 from realsim.robots.coal_geometry import pinocchio_model
 from realsim.robots.kinematics import DhChain
-from realsim.robots.link_shapes import link_placements
-from realsim.robots.shapes import Box, Mount, Shape, WorkCell
+from realsim.robots.shapes import Box, Mount, Shape, WorkCell, link_placements
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import camera_shape, d405_mount
 from refusals import refused

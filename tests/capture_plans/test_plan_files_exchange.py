@@ -24,13 +24,14 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.plan_files import plan_json
-from realsim_capture_plans.plan_files.exported import (
+from realsim_capture_plans.plan_files.foreign_plans import (
+    colliding_legs,
     export_csv,
     export_graspnet,
     export_urscript,
+    plan_of_path,
     table_frame,
 )
-from realsim_capture_plans.plan_files.imported import colliding_legs, plan_of_path
 from realsim_capture_plans.plan_files.joint_paths import read_path
 from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
 from realsim_capture_plans.planning.ordering import move_seconds

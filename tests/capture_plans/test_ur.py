@@ -25,9 +25,9 @@ from realsim.robots.arm import UR5, UR5E, known_chains
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Stop
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig
+from realsim_capture_plans.devices.ur_link import detected_model, trouble
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.devices.ur_loopback.robot import Motion
-from realsim_capture_plans.devices.ur_messages import detected_model, trouble
 from refusals import refused
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])

@@ -9,8 +9,9 @@ import time
 import urllib.request
 from pathlib import Path
 
-from documents import Block, blocks
 from printed import missing_lines
+
+from documents import Block, blocks
 
 SERVER = "# Ctrl-C ends it"
 START_S = 60.0

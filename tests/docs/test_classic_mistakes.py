@@ -4,8 +4,9 @@ import re
 
 import classic_mistakes as made
 import pytest
-from documents import ROOT
 from printed import NUMBER, near
+
+from documents import ROOT
 
 GUIDE = ROOT / "docs/how-to/calibrate-a-new-lab.md"
 ROWS = {

@@ -15,7 +15,7 @@ from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses
 from realsim.geometry import camera, se3
 from realsim.interop import colmap_from_opencv_px
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim_sim_bridge.annotation import frame_maps
+from realsim_sim_bridge.annotation import frame_labels
 
 PAGE = " ".join((ROOT / "docs/conventions.md").read_text(encoding="utf-8").split())
 LENS = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=23.0)
@@ -102,7 +102,7 @@ def test_label_maps_are_coded_as_the_table_says() -> None:
     high = np.array([0.1, 0.2, 0.3])
     Ts = np.stack([se3.from_translation(corner - [0, 0, 1]) for corner in (0 * high, high)])
     scale = np.tile(65535 / high, (2, 1)).astype(np.float32)
-    counts = frame_maps._coordinates(
+    counts = frame_labels._coordinates(
         np.zeros((1, 2, 2)), np.ones((1, 2), np.float32), np.array([[0, 1]], np.int32), Ts,
         np.ones((1, 2), bool), np.zeros((2, 3), np.float32), scale,
     )  # fmt: skip

@@ -9,6 +9,7 @@ from types import ModuleType
 
 import click
 import pytest
+
 from documents import (
     DOCUMENTS,
     LINK,

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from real_data import DATA, needs
 from realsim.errors import UnitError
-from realsim.formats.bags import BagChoice, clocks, open_bag, pixels, wire
+from realsim.formats.bags import BagChoice, joints, open_bag, pixels, wire
 from realsim.formats.bags.joints import UR_JOINTS, JointTrack, prefixes
 from realsim.formats.bags.reproject import depth_in_colour
 from realsim.formats.bags.tf_tree import TfTree, arm_frames
@@ -40,13 +40,13 @@ def test_pairs_are_one_to_one_symmetric_and_shift_with_the_clock(
     a: list[int], b: list[int], shift: int
 ) -> None:
     ta, tb = np.array(a), np.array(b)
-    found = clocks.pairs(ta, tb, 1e-4)
+    found = joints.pairs(ta, tb, 1e-4)
     assert len(set(found[:, 0])) == len(set(found[:, 1])) == len(found)
     assert np.all(np.abs(ta[found[:, 0]] - tb[found[:, 1]]) <= 1e5)
-    assert np.array_equal(clocks.pairs(ta + shift, tb + shift, 1e-4), found)
+    assert np.array_equal(joints.pairs(ta + shift, tb + shift, 1e-4), found)
     for i, j in found:  # nobody else is nearer to either
         assert abs(ta[i] - tb[j]) == np.abs(ta[i] - tb).min() == np.abs(ta - tb[j]).min()
-    same = clocks.pairs(ta, ta, 1e-4)
+    same = joints.pairs(ta, ta, 1e-4)
     assert np.array_equal(same, np.stack([np.arange(len(ta))] * 2, -1))
 
 

@@ -26,7 +26,7 @@ from realsim.formats.graspnet.annotations import (
 )
 from realsim.formats.graspnet.scene import read_annotation, read_graspnet_scene
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
-from realsim.formats.renumbered import RenumberedScene
+from realsim.formats.labelled_scene import RenumberedScene
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim.geometry.mesh import load_mesh

@@ -18,10 +18,9 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import annotation_bytes, read_objects
-from realsim.formats.graspnet.meta import meta_bytes, read_meta
-from realsim.formats.graspnet.opening import open_scene
-from realsim.formats.graspnet.single_frame import open_graspnet_frame
-from realsim.formats.graspnet.tree import open_graspnet
+from realsim.formats.graspnet.image_objects import meta_bytes, read_meta
+from realsim.formats.graspnet.opening import open_graspnet_frame, open_scene
+from realsim.formats.graspnet.scene import open_graspnet
 from realsim.geometry import se3
 from refusals import refused
 

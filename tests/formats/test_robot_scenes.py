@@ -20,9 +20,15 @@ from pybullet_utils.bullet_client import BulletClient
 import placed_scenes
 from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.mesh_obj import collision_parts, look_of
 from realsim.formats.robot_scenes.mjcf import write_mjcf_scene
-from realsim.formats.robot_scenes.placed_scene import RigidBody, file_name, seen_from, unique_names
+from realsim.formats.robot_scenes.placed_scene import (
+    RigidBody,
+    collision_parts,
+    file_name,
+    look_of,
+    seen_from,
+    unique_names,
+)
 from realsim.formats.robot_scenes.placing import TABLE_MARGIN_M, place_scene
 from realsim.formats.robot_scenes.urdf import write_urdf_scene
 from realsim.formats.robot_scenes.usd_scene import write_usd_scene

@@ -15,7 +15,7 @@ from realsim.errors import InputError
 from realsim.many.ray_driver import on_node
 from realsim.many.ray_node import work
 from realsim.many.ray_pool import _ending
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from refusals import refused
 
 # --- without Ray ----------------------------------------------------------------------------------

@@ -21,19 +21,18 @@ from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, mass_properties, merged
 from realsim.geometry.parts import part
-from realsim.models import library_commit, library_complete
+from realsim.models import library_complete, library_files
 from realsim.models import model_picture_views as views
 from realsim.models.library import ModelLibrary
-from realsim.models.library_check import check_library
 from realsim.models.library_complete import complete
 from realsim.models.library_files import read_properties
 from realsim.models.library_prepare import Matter, PrepareConfig, prepare_mesh, prepare_unscaled
-from realsim.models.library_records import ModelProperties, ScaleNote
+from realsim.models.library_reading import check_library
 from realsim.models.library_session import copy_models, known_solids
-from realsim.models.model_records import ConvexParts
+from realsim.models.model_records import ConvexParts, ModelProperties, ScaleNote
 from realsim.models.pictures import PANEL, figure_lines, model_sheet
 from realsim.records import Mesh
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim.untrusted.own_json import to_json
 from refusals import refused
 
@@ -218,7 +217,7 @@ def test_writers_wait_for_each_other(library: ModelLibrary):
 
 
 def test_a_writer_that_never_ends_is_named(library: ModelLibrary, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(library_commit, "WAIT_S", 0.1)
+    monkeypatch.setattr(library_files, "WAIT_S", 0.1)
     with only_run_in(library.folder), pytest.raises(InputError, match="another run"):
         library.add(made("box"), "box")
     assert library.entries() == []

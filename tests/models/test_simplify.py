@@ -12,13 +12,12 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import ply_bytes, transformed
 from realsim.geometry.parts import object_model, part
 from realsim.models.inspect import inspect_mesh
-from realsim.models.mesh_clustering import clustered
 from realsim.models.mesh_topology import topology
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.models.reading import read_scan
 from realsim.models.repair import RepairConfig, repaired
-from realsim.models.simplify import deviation, simplified
+from realsim.models.simplify import clustered, deviation, simplified
 from realsim.records import Mesh
 from refusals import refused
 from trimesh_solids import ball, box

@@ -13,7 +13,7 @@ from realsim.registration.body import moved_body
 from realsim.registration.compare import make_comparer
 from realsim.registration.evidence import average_cloud
 from realsim.registration.judging.held_out import box_shift_m, held_out, owned_points
-from realsim.registration.judging.scene_checks import scene_findings
+from realsim.registration.judging.scene_checks import scene_findings, unit_errors
 from realsim.registration.judging.surface_residuals import (
     LEVEL_M,
     WRONG_M,
@@ -22,7 +22,6 @@ from realsim.registration.judging.surface_residuals import (
     surface_residuals,
     wrong_bound_m,
 )
-from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.judging.verdict import (
     CONTRAST_DECIDED,
     HELD_OUT,

@@ -10,11 +10,10 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.body import Body, moved_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame, LazyFrame, correct_frame
-from realsim.registration.fixed_cameras import FixedCamera, FixedFrames, noise_of, still_depth
 from realsim.registration.intake import Intake, take_in
 from realsim.registration.many_views import (
     LEAST_SIGMA_DEG,
@@ -24,6 +23,7 @@ from realsim.registration.many_views import (
     register_many,
 )
 from realsim.registration.simulated import TableScene
+from realsim.registration.views import FixedCamera, FixedFrames, noise_of, still_depth
 from realsim.rendering.labels import LabelRenderer
 from refusals import refused
 from table_faults import without_any_depth

@@ -14,10 +14,14 @@ from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_camera import DepthCamera
-from realsim.rendering.depth_sensors.loss import material_loss, signal_loss
+from realsim.rendering.depth_sensors.loss import (
+    half_occluded,
+    material_loss,
+    shadow_mask,
+    signal_loss,
+)
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import profile
-from realsim.rendering.depth_sensors.shadow import half_occluded, shadow_mask
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene
 from realsim.rendering.stereo import StereoConfig

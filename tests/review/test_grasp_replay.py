@@ -10,7 +10,7 @@ from realsim import Mesh
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import STAGES
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.review.replaying import grasp_words as words
 from realsim.review.replaying.grasp_replay import GraspMotion, Motions, ReplayPlayer, hand_approach
 from realsim.robots.hand import find_hand

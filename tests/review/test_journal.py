@@ -20,9 +20,10 @@ from realsim.review.corrections import (
     check_is_current,
     corrected_scene,
     decision_on,
+    marked_models,
     pending,
+    symmetry_of,
 )
-from realsim.review.symmetric import marked_models, symmetry_of
 from refusals import refused
 
 

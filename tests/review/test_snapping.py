@@ -14,7 +14,7 @@ from realsim.geometry.mesh_shape import sample_surface
 from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectPose, Scene, SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review.placing.depth_residuals import CloudResiduals, noise_of, residual_rgb
 from realsim.review.placing.measured_views import depth_bias_of, usable_views

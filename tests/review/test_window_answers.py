@@ -25,7 +25,7 @@ from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.review import ReviewServer
 from realsim.review.window.browser import Place
-from realsim.review.window.gui_values import check_update
+from realsim.review.window.from_browser import check_update
 from realsim.review.window.window import Window
 from realsim.store import SessionStore, save_grasps, save_scene
 from realsim.store.session_store import rgb_path

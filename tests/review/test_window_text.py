@@ -12,7 +12,7 @@ from realsim.geometry import se3
 from realsim.review import journal
 from realsim.review.window import window_text
 from realsim.review.window.browser import Place
-from realsim.review.window.keys import KEYS, STEPS
+from realsim.review.window.from_browser import KEYS, STEPS
 from reviewed_boxes import MODELS, SCENE
 
 TALL = 1

@@ -18,8 +18,8 @@ from realsim.robots.arm import ArmFile, find_arm, known_chains
 from realsim.robots.check_arm import check_arm
 from realsim.robots.check_hand import check_hand, pad_frames, path_error
 from realsim.robots.compiled_chain import chain_numbers, follow_lines, frames_into, jacobian_into
-from realsim.robots.dh_of_chain import dh_of_chain
 from realsim.robots.hand import find_hand, hand_of_json
+from realsim.robots.kinematics import dh_of_chain
 from realsim.robots.robot_files import VARIABLE, names_of, robot_file
 from refusals import refused
 from robotiq_linkages import LOOPS, arc_error_mm, turned

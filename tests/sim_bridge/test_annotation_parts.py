@@ -15,7 +15,7 @@ from realsim.geometry import camera, se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 from realsim.rendering.rays import BACKGROUND
-from realsim_sim_bridge.annotation import frame_maps
+from realsim_sim_bridge.annotation import frame_labels
 from realsim_sim_bridge.annotation.annotate import frame_files
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig, SightConfig
 from realsim_sim_bridge.annotation.files import (
@@ -160,7 +160,7 @@ def test_counts_equal_those_of_the_float_maps() -> None:
     window = (slice(10, 110), slice(20, 150))
     seen = (labels.ids[window] >= 0) & (rng.random((100, 130)) < 0.9)
     boxes = np.stack([p.mesh.bounds for p in placed])
-    got = frame_maps.coordinate_counts(labels, window, seen, boxes)
+    got = frame_labels.coordinate_counts(labels, window, seen, boxes)
     points = labels.object_coordinates()[window]
     for k in range(3):
         mask = seen & (labels.ids[window] == k)
@@ -169,7 +169,7 @@ def test_counts_equal_those_of_the_float_maps() -> None:
         # Float32 products may fall on either side of a half.
         assert np.max(np.abs(got[mask].astype(int) - wanted)) <= 1
     assert not got[~seen].any()
-    normals = frame_maps.normal_counts(labels).astype(int)
+    normals = frame_labels.normal_counts(labels).astype(int)
     assert np.max(np.abs(normals - normal_counts(labels.normals()))) <= 1
     assert np.array_equal(normals.any(axis=-1), labels.geometry >= 0)
 

@@ -15,9 +15,14 @@ from realsim.robots.coal_geometry import Body, Geometry
 from realsim.robots.compiled_chain import follow_lines, in_dh_frame
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm.arm_space import FREE, IN_ITSELF, IN_TABLE, ArmSpace, ArmSpaceConfig
-from realsim_sim_bridge.arm.grasping_arm import GraspingArm
+from realsim_sim_bridge.arm.grasping_arm import (
+    GraspingArm,
+    Spheres,
+    arm_spheres,
+    hand_spheres,
+    solid_points,
+)
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
-from realsim_sim_bridge.arm.link_spheres import Spheres, arm_spheres, hand_spheres, solid_points
 from realsim_sim_bridge.arm.obstacles import least_distance, obstacles_of
 from realsim_sim_bridge.arm.timing import TimingConfig, straight_times, timed_path
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.robots.arm import find_arm
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
-from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.reach import (
     ReachConfig,
@@ -21,7 +20,7 @@ from realsim_sim_bridge.arm.reach import (
     home_joints,
 )
 from realsim_sim_bridge.arm.reach_config import ChosenArm, chosen_arm
-from realsim_sim_bridge.arm.swept_hand import first_touched
+from realsim_sim_bridge.arm.straight_moves import first_touched, touched_when_lifted
 from realsim_sim_bridge.arm.timing import TimingConfig
 from realsim_sim_bridge.grasping.candidates import Surroundings
 from realsim_sim_bridge.grasping.hand_free import first_point_inside

@@ -18,8 +18,7 @@ from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim_sim_bridge.scenes import stable_state, table_world
 from realsim_sim_bridge.scenes.importers import from_bop, load_scene_source
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
-from realsim_sim_bridge.scenes.stable_state import HEADERS, stand_rows
-from realsim_sim_bridge.scenes.stand_picture import stand_picture
+from realsim_sim_bridge.scenes.stable_state import HEADERS, stand_picture, stand_rows
 from realsim_sim_bridge.scenes.table_world import TableWorld
 from refusals import refused
 from trimesh_solids import box

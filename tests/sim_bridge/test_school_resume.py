@@ -16,8 +16,8 @@ from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.many import PoolConfig, WorkerDiedError, open_pool
 from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results, school
-from realsim_sim_bridge.school.object_slips import in_words
-from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
+from realsim_sim_bridge.school.cache_folder import RUN_FILE, folder_of_run
+from realsim_sim_bridge.school.shards import in_words
 from refusals import refused
 from school_scenes import at, model, scene, small_worlds
 from started_scripts import started

@@ -11,7 +11,7 @@ from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, project, undistort
 from realsim.records import CameraIntrinsics, TagBoard
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim_calibration.depth.bias import DepthBiasReport, estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.depth.fit import DepthBiasConfig

@@ -11,14 +11,14 @@ from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
-from realsim.formats.graspnet.tree import open_graspnet
+from realsim.formats.graspnet.scene import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import PlacedMesh
-from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
+from realsim_sim_bridge.synthetic.config import hemisphere_cameras
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=151.0, cx=78.7, cy=60.2)
 TABLE = se3.from_rt(se3.exp_so3([0.0, 0.0, 0.7]), [0.5, -0.1, 0.1])

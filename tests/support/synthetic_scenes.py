@@ -15,7 +15,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import save_scene
-from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
+from realsim_sim_bridge.synthetic.config import hemisphere_cameras
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
 INTRINSICS = CameraIntrinsics(

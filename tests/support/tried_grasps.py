@@ -5,8 +5,7 @@ import numpy as np
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
-from realsim.records.grasps import MEASURES
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import MEASURES, PHASES, GraspTrajectories
 
 REASONS = ("", "lost in lift", "kein Weg: Arm stößt an", "slip of 3 cm, 'oscillate'", "日本")
 

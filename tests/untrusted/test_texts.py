@@ -23,10 +23,9 @@ from realsim import records
 from realsim import store as stores
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.records.calibration import RobotMap
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias, RobotMap
 from realsim.robots.arm import UR5
-from realsim.robots.hand_file import PadFile
+from realsim.robots.robot_files import PadFile
 from realsim.untrusted import values
 from realsim.untrusted.json_text import parsed_json, read_json
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json

@@ -12,8 +12,8 @@ from realsim.geometry.normal_equations import inverse
 from realsim.records import CameraIntrinsics
 from realsim_calibration.calibrate import CalibrationConfig, determined_priors
 from realsim_calibration.cameras import faults, results
-from realsim_calibration.cameras.checks import armless_checks, rig_checks
 from realsim_calibration.cameras.problem import RigProblem, first_state
+from realsim_calibration.cameras.results import armless_checks, rig_checks
 from realsim_calibration.cameras.rig import Rig, Sighting
 from realsim_calibration.cameras.solve import (
     RigSolution,

@@ -18,7 +18,6 @@ from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.cameras.problem import RigModel, RigProblem, RigState
 from realsim_calibration.fit import joint_solve, noise_scale
-from realsim_calibration.fit.board_pose import refine_board_pose
 from realsim_calibration.fit.linear_model import LinearFit
 from realsim_calibration.fit.robot_error import ErrorBasis, arm_basis, map_record
 from realsim_calibration.fit.robust_fit import (
@@ -28,7 +27,7 @@ from realsim_calibration.fit.robust_fit import (
     map_choices,
     with_arm,
 )
-from realsim_calibration.fit.view_system import camera_record
+from realsim_calibration.fit.view_system import camera_record, refine_board_pose
 from realsim_calibration.screening import HandEyeConfig
 
 SAG_RAD = 5e-4

@@ -24,7 +24,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim_calibration.depth.area import BoardDepth, measure_board
 from realsim_calibration.depth.board import DepthBoardView, DepthSetup
 from realsim_calibration.depth.checks import (

@@ -10,7 +10,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, projection_jacobian
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration.fit.board_pose import planar_poses
+from realsim_calibration.fit.view_system import planar_poses
 from realsim_calibration.results import BoardShape
 from realsim_calibration.views import TargetDetection, target_middle
 

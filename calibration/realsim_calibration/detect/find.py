@@ -17,13 +17,13 @@ from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.charuco import find_charuco
 from realsim_calibration.detect.chessboard import find_chessboard
-from realsim_calibration.detect.drawings import drawing_reason
 from realsim_calibration.detect.edges import bend, straighten
 from realsim_calibration.detect.ellipses import Dots, find_blobs, outline_bias, refine_dots
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
 from realsim_calibration.detect.images import gray_image, no_points, size_of
 from realsim_calibration.detect.lattice import Laid, Node, grow_lattices, lay_pattern
 from realsim_calibration.detect.tags import TagDetections, detect_tags
+from realsim_calibration.detect.visible import drawing_reason
 from realsim_calibration.views import TargetDetection
 
 LEVELS = 4

@@ -4,11 +4,15 @@ What other programs get is `X_alone` with the camera and the target's place that
 `frames`; X with the robot's error map is in `calibration.json` only (`calibration_file`).
 
 A calibration for ROS 1 and 2: commands, launch file, URDF, easy_handeye, camera_info.
+
+Files that a calibration writes anew, and what a person has edited in them: it is kept.
 """
 
+import hashlib
+import itertools
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +20,7 @@ from numpy.typing import NDArray
 
 from realsim import __version__
 from realsim.arrays import Array
+from realsim.formats.export_folder import SUMS_FILE
 from realsim.store import atomic
 from realsim_calibration.exports.calibration_file import calibration_text
 from realsim_calibration.exports.frames import (
@@ -28,9 +33,44 @@ from realsim_calibration.exports.frames import (
     quaternion_xyzw,
     roll_pitch_yaw,
 )
-from realsim_calibration.exports.replaced import replace_files
 from realsim_calibration.lens.camera_files import number, ros_yaml, yaml_matrix
 from realsim_calibration.results import HandEyeReport
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files and the list of their checksums.
+
+    Args:
+        folder: where to; made where needed.
+        contents: path in it -> bytes.
+
+    Returns:
+        Where files are now that were not as the list says: NAME.kept beside the new one.
+    """
+    sums = folder / SUMS_FILE
+    listed = sums.read_text(errors="replace").splitlines() if sums.is_file() else []
+    written = {name: digest for digest, _, name in (line.partition("  ") for line in listed)}
+    kept: list[Path] = []
+    for name, data in contents.items():
+        path = folder / name
+        there = path.read_bytes() if name in written and path.is_file() else data
+        if there != data and _digest(there) != written[name]:
+            kept.append(_free_name(path))
+            path.rename(kept[-1])
+        atomic.write_bytes(path, data)
+    lines = (f"{_digest(data)}  {name}\n" for name, data in contents.items())
+    atomic.write_text(sums, "".join(lines))
+    return kept
+
+
+def _free_name(path: Path) -> Path:
+    """Return NAME.kept, or NAME.kept2 and so on where that is there."""
+    names = (path.with_name(f"{path.name}.kept{k if k > 1 else ''}") for k in itertools.count(1))
+    return next(name for name in names if not name.exists())
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def ros2_command(report: HandEyeReport, frames: FrameNames) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.records import Check, Target
-from realsim_calibration.detect.drawings import DRAWN
+from realsim_calibration.detect.visible import DRAWN
 from realsim_calibration.faults.diagnose import diagnose
 from realsim_calibration.faults.diagnosis import Diagnosis
 from realsim_calibration.faults.half_turns import HalfTurns, synchronise_half_turns

@@ -20,7 +20,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
 from realsim_calibration.faults import diagnosis, pairing
-from realsim_calibration.faults.copied_views import Groups, find_copies
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.hypotheses import (
     Hypothesis,
@@ -36,6 +35,7 @@ from realsim_calibration.faults.hypotheses import (
     simple,
     size_name,
 )
+from realsim_calibration.faults.pairing import Groups, find_copies
 from realsim_calibration.faults.tool_offset import tool_offset
 from realsim_calibration.fit.closed_forms import MIN_VIEWS, motions, pose_stacks, principal_turns
 from realsim_calibration.results import Mode

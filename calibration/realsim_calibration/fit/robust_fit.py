@@ -19,8 +19,6 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.fit import noise_scale
-from realsim_calibration.fit.board_pose import refine_board_pose
-from realsim_calibration.fit.effective import PlainFit, plain_fits, projection, stretch
 from realsim_calibration.fit.joint_solve import (
     JointProblem,
     JointState,
@@ -28,7 +26,14 @@ from realsim_calibration.fit.joint_solve import (
     shaped_points,
     smooth_errors,
 )
-from realsim_calibration.fit.linear_model import LinearFit, LinearModel
+from realsim_calibration.fit.linear_model import (
+    LinearFit,
+    LinearModel,
+    PlainFit,
+    plain_fits,
+    projection,
+    stretch,
+)
 from realsim_calibration.fit.robot_error import (
     ErrorBasis,
     arm_basis,
@@ -36,7 +41,7 @@ from realsim_calibration.fit.robot_error import (
     map_record,
     pose_features,
 )
-from realsim_calibration.fit.view_system import SHARED
+from realsim_calibration.fit.view_system import SHARED, refine_board_pose
 from realsim_calibration.results import Stretch
 
 if TYPE_CHECKING:

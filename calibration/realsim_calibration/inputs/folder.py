@@ -13,8 +13,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_calibration.inputs.columns import PoseTable, raw_from_table
 from realsim_calibration.inputs.image_files import content_of, list_images
-from realsim_calibration.inputs.layouts import image_folder, pose_folders, poses_of
-from realsim_calibration.inputs.pairing import Pairing, pair
+from realsim_calibration.inputs.pairing import Pairing, image_folder, pair, pose_folders, poses_of
 from realsim_calibration.inputs.pose_file import file_text, file_tree, read_pose_file
 from realsim_calibration.inputs.pose_text import table_from_text
 from realsim_calibration.inputs.raw_poses import RawPoses, listed_readings

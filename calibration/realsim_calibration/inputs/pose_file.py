@@ -13,9 +13,8 @@ from realsim.formats.folders.listing import natural_key
 from realsim_calibration.inputs.columns import LABEL_NAMES, PoseTable, raw_from_table
 from realsim_calibration.inputs.pose_arrays import table_from_npy, table_from_npz
 from realsim_calibration.inputs.pose_text import decoded, table_from_text
-from realsim_calibration.inputs.pose_tree import table_from_tree
+from realsim_calibration.inputs.pose_tree import loaded_json, loaded_yaml, table_from_tree
 from realsim_calibration.inputs.raw_poses import RawPoses
-from realsim_calibration.inputs.tree_loading import loaded_json, loaded_yaml
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".log", ".json", ".yaml", ".yml", ".npy", ".npz")
 """Endings of pose files."""

@@ -7,7 +7,7 @@ from realsim.errors import InputError
 from realsim.untrusted.files import checked_bytes
 from realsim.untrusted.xml_tree import parsed_xml
 from realsim_calibration.inputs.pose_text import number_of
-from realsim_calibration.inputs.tree_loading import loaded_json, loaded_xml, loaded_yaml
+from realsim_calibration.inputs.pose_tree import loaded_json, loaded_xml, loaded_yaml
 
 Fields = dict[str, Any]
 LARGEST_BYTES = 4_000_000

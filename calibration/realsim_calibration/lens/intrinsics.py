@@ -19,7 +19,6 @@ from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.view_system import camera_record, camera_vector
 from realsim_calibration.lens.bundle import CAMERA_TERMS, LensFit, Observations, Prior, adjust
 from realsim_calibration.lens.checks import intrinsics_checks
-from realsim_calibration.lens.choice import ModelScore, fold_of_views, halves, score_models
 from realsim_calibration.lens.covariance import global_covariance
 from realsim_calibration.lens.fit import (
     SIGMA_FLOOR_PX,
@@ -30,7 +29,14 @@ from realsim_calibration.lens.fit import (
     robust_sigma,
     settle,
 )
-from realsim_calibration.lens.models import MODELS, lens_prior
+from realsim_calibration.lens.models import (
+    MODELS,
+    ModelScore,
+    fold_of_views,
+    halves,
+    lens_prior,
+    score_models,
+)
 from realsim_calibration.lens.observations import ROUNDS, Corners, find_outliers, gather
 from realsim_calibration.lens.report import (
     GOOD_TILT_DEG,

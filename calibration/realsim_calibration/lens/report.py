@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.lens.choice import ModelScore
 from realsim_calibration.lens.covariance import projection_sd
-from realsim_calibration.lens.models import TERM_NAMES
+from realsim_calibration.lens.models import TERM_NAMES, ModelScore
 from realsim_calibration.results import BoardShape
 
 QUARTERS = ("upper left", "upper right", "lower left", "lower right")

@@ -13,7 +13,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration.fit.board_pose import planar_poses
+from realsim_calibration.fit.view_system import planar_poses
 from realsim_calibration.hand_eye import calibrate_hand_eye_report
 from realsim_calibration.planning.next_view import NextView, predicted_boards, rank_next_views
 from realsim_calibration.planning.view_proposals import (

@@ -25,8 +25,7 @@ from realsim.errors import InputError
 from realsim.robots.arm import RobotArm, arm_of
 from realsim.robots.coal_geometry import Body, Collider, Geometry, Pair
 from realsim.robots.kinematics import DhChain
-from realsim.robots.link_shapes import finite_box, link_placements
-from realsim.robots.shapes import Mount, WorkCell
+from realsim.robots.shapes import Mount, WorkCell, finite_box, link_placements
 from realsim_capture_plans.collision.mount import camera_shape
 
 SWEEP_STEPS = 18

@@ -17,10 +17,16 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.interop import import_pyrealsense2
-from realsim_capture_plans.devices import realsense_facts as facts
+from realsim_capture_plans.devices import realsense_streams as facts
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
-from realsim_capture_plans.devices.realsense_facts import intrinsics_of
-from realsim_capture_plans.devices.realsense_pairs import COLOR, DEPTH, Alignment, Pair, PairBuffer
+from realsim_capture_plans.devices.realsense_streams import (
+    COLOR,
+    DEPTH,
+    Alignment,
+    Pair,
+    PairBuffer,
+    intrinsics_of,
+)
 
 __all__ = ["EndOfRecordingError", "RealSenseCamera", "RealSenseConfig", "intrinsics_of"]
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from realsim.errors import InputError
-from realsim_capture_plans.devices import ur_messages
+from realsim_capture_plans.devices import ur_link
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Stop
 from realsim_capture_plans.devices.ur_link import Glance, LinkError, UrLink, probe
 
@@ -133,9 +133,9 @@ class UrConnection:
         self._identify(who, glance, seen)
         self.refuse_trouble(seen, program=False)
         if who["remote"] is False:
-            raise self._trouble_error(ur_messages.LOCAL)
+            raise self._trouble_error(ur_link.LOCAL)
         moving = float(np.abs(seen["speeds"]).max()) > c.still_speed_rad_s
-        playing = seen["runtime_state"] == ur_messages.RUNTIME_PLAYING
+        playing = seen["runtime_state"] == ur_link.RUNTIME_PLAYING
         if moving or (playing and glance.script_register not in SCRIPT_STATES):
             raise self.stop_error(
                 "not ready",
@@ -231,7 +231,7 @@ class UrConnection:
             ArmStoppedError: it is stopped, off, or (`program`) does not run our program.
         """
         runtime = int(seen["runtime_state"]) if program else None
-        found = ur_messages.trouble(
+        found = ur_link.trouble(
             seen["robot_mode"], seen["safety_mode"], seen["safety_bits"], runtime
         )
         if found is not None:
@@ -270,7 +270,7 @@ class UrConnection:
         now = Identity(
             polyscope=str(who["version"] or ".".join(map(str, glance.version))),
             serial=who["serial"],
-            model=ur_messages.detected_model(who["model"], glance.version[0]),
+            model=ur_link.detected_model(who["model"], glance.version[0]),
             payload_kg=seen["payload_kg"],
         )
         if before is not None and before.serial != now.serial:
@@ -283,7 +283,7 @@ class UrConnection:
     def _named(self, said: str) -> ArmStoppedError:
         """Return the error for what ur_rtde said."""
         if "remote control" in said:
-            return self._trouble_error(ur_messages.LOCAL)
+            return self._trouble_error(ur_link.LOCAL)
         if "already in use" in said:
             return self._in_use()
         if "start control script" in said:
@@ -302,7 +302,7 @@ class UrConnection:
             "PROFINET and MODBUS there",
         )
 
-    def _trouble_error(self, found: ur_messages.Trouble) -> ArmStoppedError:
+    def _trouble_error(self, found: ur_link.Trouble) -> ArmStoppedError:
         return self.stop_error(found.stop, f"its controller reports {found.found}", found.remedy)
 
     def _loss(self, why: str) -> ArmStoppedError:

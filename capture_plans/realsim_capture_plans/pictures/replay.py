@@ -16,12 +16,13 @@ from realsim.interop import viser_wxyz_position
 from realsim.robots.shapes import Box
 from realsim.store.atomic import write_text
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.pictures.arm_chart import box_edges, frustum_lines
-from realsim_capture_plans.pictures.arm_looks import (
+from realsim_capture_plans.pictures.arm_chart import (
     Part,
     arm_looks,
     arm_parts,
+    box_edges,
     camera_parts,
+    frustum_lines,
     part_frames,
 )
 from realsim_capture_plans.pictures.motion_charts import GROUP_LABELS

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import shortened
-from realsim.app.report.sliders import registration_pairs
+from realsim.app.report.registering import registration_pairs
 from realsim.arrays import Image
 from realsim.pages import Page, Picture, View
 from realsim.rendering.overlay import VERDICT_RGB
@@ -147,7 +147,7 @@ def _add_sections(
 
 def _map_view(store: SessionStore, view: int, flagged: set[int]) -> View:
     """Return the maps of a view that have been written, under its photograph."""
-    from realsim_sim_bridge.annotation.frame_maps import map_path
+    from realsim_sim_bridge.annotation.frame_labels import map_path
 
     layers: dict[str, Picture] = {"photo": partial(store.rgb, view)}
     for name, title in MAP_TITLES.items():
@@ -161,7 +161,7 @@ def _map_picture(store: SessionStore, name: str, view: int) -> Image:
     from realsim.formats import label_maps
     from realsim.rendering.map_pictures import NOTHING, instance_picture, normals_picture
     from realsim.rendering.overlay import depth_picture
-    from realsim_sim_bridge.annotation.frame_maps import map_path
+    from realsim_sim_bridge.annotation.frame_labels import map_path
 
     counts: Any = store.read_image(map_path(name, view))
     if name == "instance":

@@ -11,7 +11,7 @@ from realsim.app.stages import judged_scene, open_session, registered_views, ses
 from realsim.arrays import Image, evenly
 from realsim.many import Workers
 from realsim.store import SessionStore
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary

@@ -14,9 +14,14 @@ from typing import Any
 import numpy as np
 
 from realsim.app.calibrate import camera_frames
-from realsim.app.calibrate.board_views import BOARD_FILE, known_arm, note_depth_bias
+from realsim.app.calibrate.board_views import (
+    BOARD_FILE,
+    find_in_images,
+    known_arm,
+    note_depth_bias,
+    why_not_found,
+)
 from realsim.app.calibrate.folder import MADE_OF, made_of, require_free_results
-from realsim.app.calibrate.images import find_in_images, why_not_found
 from realsim.app.calibrate.show import show_checks
 from realsim.app.console import Console
 from realsim.app.register.results import keep_refined

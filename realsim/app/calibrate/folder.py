@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import known_arm
-from realsim.app.calibrate.images import (
+from realsim.app.calibrate.board_views import (
     find_in_images,
+    known_arm,
     require_one_size,
     require_target,
     require_views,
@@ -43,7 +43,7 @@ from realsim_calibration import (
 )
 from realsim_calibration.calibrate import require_given_camera
 from realsim_calibration.fit.closed_forms import MIN_VIEWS
-from realsim_calibration.inputs.layouts import MADE_OF
+from realsim_calibration.inputs.pairing import MADE_OF
 from realsim_calibration.results import Clock
 
 if TYPE_CHECKING:
@@ -345,7 +345,7 @@ def _from_logs(
     request: FolderRequest, console: Console
 ) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
     """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
-    from realsim.app.calibrate.clock import pair_pose_logs
+    from realsim.app.calibrate.session import pair_pose_logs
     from realsim_calibration.inputs.pose_file import read_pose_file
     from realsim_calibration.inputs.readings import reading_from_text
 

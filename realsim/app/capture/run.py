@@ -19,7 +19,7 @@ from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim.records import CaptureSession, Target
 from realsim.store import SessionStore
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim_capture_plans.capturing import contact_sheet
 from realsim_capture_plans.capturing.capture import (
     CaptureConfig,

@@ -16,7 +16,7 @@ from realsim.app.console import Console, shortened
 from realsim.app.option_values import ranges_of
 from realsim.app.stages import hint_of
 from realsim.errors import InputError
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim.store.session_check import CheckReport, check_session, is_session
 from realsim.store.session_repair import RepairReport, repair_session
 

@@ -44,7 +44,7 @@ def show_command(
 
     Without COMMAND only what is set somewhere; of a COMMAND, every option.
     """
-    from realsim.app.config.applied import config_file
+    from realsim.app.config.settings import config_file
     from realsim.app.config.template import DEFAULT, in_force, strange_variables
 
     file = config_file(ctx)

@@ -1,6 +1,8 @@
 """What a file of settings may say, held against the commands' own options.
 
 Which file of settings is in force, and where in it a setting stands.
+
+Settings of a file become the defaults of the commands.
 """
 
 import os
@@ -14,6 +16,7 @@ from typing import Any, cast
 import click
 
 from realsim.app import command as command_line
+from realsim.app.command import Group
 from realsim.app.option_values import Amount
 from realsim.errors import InputError
 from realsim.untrusted.toml_text import read_toml
@@ -255,3 +258,48 @@ def _shown(value: Any) -> str:
 def _perhaps(name: str, names: list[str]) -> str:
     close = get_close_matches(name, names, n=2)
     return f" (did you mean {' or '.join(close)}?)" if close else ""
+
+
+FILE = "realsim.config_file"
+"""In the context: the ConfigFile in force, or None."""
+TROUBLE = "realsim.config_trouble"
+"""In the context: what is wrong with the file, for the commands that can do without."""
+DO_WITHOUT = ("config", "completion", "doctor")
+"""These run although the file is wrong: they tell about it, or help to mend it."""
+
+
+def apply_config(ctx: click.Context, named: Path | None, *, quiet: bool) -> None:
+    """Find the file in force, and give its settings to the commands of `ctx`.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    root = ctx.command
+    assert isinstance(root, Group)
+    ctx.meta[FILE] = None
+    try:
+        file = find_config(named)
+        if file is None:
+            return
+        ctx.meta[FILE] = file
+        ctx.default_map = settings_of(root, file)
+    except InputError as error:
+        if ctx.invoked_subcommand not in DO_WITHOUT:
+            raise
+        ctx.meta[TROUBLE] = error
+        return
+    if not file.is_named and not quiet and ctx.invoked_subcommand not in DO_WITHOUT:
+        click.echo(f"note: settings are taken from {HERE} in this folder.", err=True)
+
+
+def config_file(ctx: click.Context) -> ConfigFile | None:
+    """Return the file in force.
+
+    Raises:
+        InputError: it cannot be used.
+    """
+    trouble: InputError | None = ctx.meta.get(TROUBLE)
+    if trouble is not None:
+        raise trouble
+    file: ConfigFile | None = ctx.meta.get(FILE)
+    return file

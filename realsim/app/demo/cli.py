@@ -34,8 +34,14 @@ def demo_command(
 
     With --site, write the session's pages as a folder that any file server hosts.
     """
-    from realsim.app.demo.run import QUICK, DemoConfig, demo_document, run_demo, show_demo
-    from realsim.app.demo.site import write_site
+    from realsim.app.demo.run import (
+        QUICK,
+        DemoConfig,
+        demo_document,
+        run_demo,
+        show_demo,
+        write_site,
+    )
 
     setup = {k: v for k, v in (setup | {"grasps_per_object": grasps}).items() if v is not None}
     result = run_demo(DemoConfig(**(QUICK if quick else {}) | setup), out, console)

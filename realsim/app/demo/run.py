@@ -3,9 +3,12 @@
 The pipeline sees only what a real lab would give it: images, joint angles, the controller's poses,
 the camera's factory values, the operator's rough poses. The truth goes to a folder of its own,
 which only the report opens.
+
+`realsim demo --site`: the pages of a session as a folder that any file server hosts.
 """
 
 import json
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,16 +22,19 @@ from realsim.app.register.run import register_session
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import run_in_session
 from realsim.app.stages import BOARD_VIEWS, save_starts
+from realsim.app.truth import LoopErrors
 from realsim.errors import InputError
+from realsim.pages import Cell, Page
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene
 from realsim.robots.arm import find_arm
-from realsim.store import SessionStore
-from realsim.store.lock import only_run_in
+from realsim.store import SessionStore, atomic
+from realsim.store.atomic import only_run_in
 
 if TYPE_CHECKING:
     from realsim.app.truth import LoopErrors
     from realsim_capture_plans import CapturePlan
     from realsim_capture_plans.lab import SimulatedLab
+
 
 BOARD_VIEW_SHARE = 24
 """Most board views of a demo; a smaller demo takes as many as scene views, 10 at least."""
@@ -234,3 +240,40 @@ def show_demo(result: DemoResult, console: Console, site: Path | None = None) ->
     console.say(f"  1. Open {site or result.report} in a browser.")
     console.say(f"  2. Judge the poses:  realsim review {result.store.folder}")
     console.say("  3. Take your own images, recording or data set:  realsim import SOURCE session")
+
+
+PAGES = (
+    ("scene.html", "Scene", "Turn the point cloud, the models, the cameras and the grasps in 3D."),
+    ("report.html", "Report", "Calibration, poses, grasps and labels: figures, checks, pictures."),
+    ("school.html", "School sheet", "Every grasp that was tried, and what it failed on."),
+    ("statistics.html", "Statistics", "Counts, beside those of published data sets."),
+)
+"""File, title and content of every page."""
+
+
+def write_site(store: SessionStore, errors: LoopErrors, folder: Path, console: Console) -> Path:
+    """Write the pages of a session that went through the whole loop; return the first one.
+
+    Nothing on them is loaded from elsewhere, and links are relative.
+    """
+    from realsim.app.verbs import review, run
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with console.stage("site", str(folder)):
+        for name in ("report.html", "school.html"):
+            shutil.copyfile(store.path(f"reports/{name}"), folder / name)
+        review(store.folder, static=folder / "scene.html", quiet=True)
+        counts = run("stats", (store.folder,), {"out": folder, "quiet": True}).document
+        title = "A capture session, from plan to grasp labels"
+        page = Page(title=title, about=f"Made by realsim in a {store.session.name}.")
+        drawn = store.path("registration/pictures/overlay.jpg").read_bytes()
+        figures = [(value, name) for name, value, goal in errors.rows() if goal]
+        figures.append((f"{counts['school']['candidates']:,}", "grasps tried by physics"))
+        page.lead(drawn, "What registration found, drawn on photographs.", figures)
+        page.section("Pages")
+        rows = [[Cell(name, href=f"./{file}"), text] for file, name, text in PAGES]
+        page.table(["page", "what it shows"], rows)
+        page.section("Make it yourself", "This needs no robot and no camera:")
+        page.code("realsim demo --site site")
+        atomic.write_bytes(folder / "index.html", page.encode())
+    return folder / "index.html"

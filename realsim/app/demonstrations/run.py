@@ -26,7 +26,7 @@ from realsim.formats.lerobot.episodes import INFO, NOTES
 from realsim.formats.lerobot.spool import EncodedEpisode, encoded, import_av
 from realsim.geometry import se3
 from realsim.many import Outcome, PoolConfig, Sent, Task, at_most, open_pool, run_many
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import Scene
 from realsim.untrusted.own_json import read_object
 
@@ -273,7 +273,7 @@ def export_demonstrations(
     from realsim.app.demonstrations.page import demonstrations_card, page_file
     from realsim.app.export.card import CARD_FILE
     from realsim.formats.lerobot.writer import write_lerobot
-    from realsim.store.lock import only_run_in
+    from realsim.store.atomic import only_run_in
 
     import_av()
     require_outside(out, [source])

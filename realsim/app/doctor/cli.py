@@ -39,7 +39,7 @@ def doctor_command(
 
 def _settings(ctx: click.Context) -> "list[Finding]":
     """Return what is to be said of the file of settings."""
-    from realsim.app.config.applied import config_file
+    from realsim.app.config.settings import config_file
     from realsim.app.doctor.machine import Finding
     from realsim.errors import InputError
 

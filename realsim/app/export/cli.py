@@ -51,8 +51,8 @@ def export_command(
     SOURCE is a session, a folder of sessions (of `realsim generate` or `upgrade`), a BOP or a
     GraspNet data set. Interrupted, the same command goes on where it stopped.
     """
-    from realsim.app.export.request import ExportRequest
     from realsim.app.export.run import run_export, show_export
+    from realsim.app.export.target import ExportRequest
 
     request = ExportRequest(masks=not no_masks, camera=camera_name, **options)
     result = run_export(request, out, console)

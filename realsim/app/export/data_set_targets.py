@@ -33,7 +33,7 @@ def _bop_root(folder: ExportFolder, job: target.RootJob) -> Sequence[str]:
 
 
 def _graspnet(scene: LabelledScene, folder: ExportFolder, job: target.SceneJob) -> WrittenScene:
-    from realsim.formats.graspnet.tree import CAMERAS
+    from realsim.formats.graspnet.scene import CAMERAS
     from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
     from realsim.formats.graspnet.writing import write_graspnet_scene
 

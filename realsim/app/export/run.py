@@ -13,25 +13,44 @@ from realsim.app.annotate.current import refresh_labels
 from realsim.app.check.checksums import require_as_written
 from realsim.app.console import Console
 from realsim.app.export import sources
-from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes, options_told
-from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
+from realsim.app.export.card import (
+    CARD_FILE,
+    CROISSANT_FILE,
+    DatasetCard,
+    SceneFacts,
+    card_bytes,
+    croissant_bytes,
+    options_told,
+)
 from realsim.app.export.data_set_targets import DATA_SETS
-from realsim.app.export.request import ExportRequest
 from realsim.app.export.scene_targets import GRASPS, SCENES
-from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
+from realsim.app.export.target import (
+    TABLE,
+    TRIED,
+    ExportRequest,
+    RootJob,
+    SceneJob,
+    ScenePlace,
+    Target,
+)
 from realsim.app.outputs import require_outside
 from realsim.app.stages import changed_fields, made_of, open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import executed
-from realsim.formats.labelled_scene import LabelledScene, WrittenScene
-from realsim.formats.renumbered import RenumberedScene, ids_without_mesh, shared_ids
+from realsim.formats.labelled_scene import (
+    LabelledScene,
+    RenumberedScene,
+    WrittenScene,
+    ids_without_mesh,
+    shared_ids,
+)
 from realsim.formats.session_scene import SessionScene
 from realsim.records import ObjectModel
 from realsim.store import provenance
+from realsim.store.atomic import only_run_in
 from realsim.store.cameras import camera_folders
-from realsim.store.lock import only_run_in
 
 ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "attribution")
 """Options of every format."""

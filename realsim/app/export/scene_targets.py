@@ -43,7 +43,7 @@ def session_of(scene: LabelledScene) -> SessionScene:
 
 
 def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.app.school.export import export
+    from realsim.app.school.files import export
 
     session, inner = session_of(scene), folder.below(job.place.name)
     request = job.request

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.export.card import SceneTrust
-from realsim.app.export.request import ExportRequest
+from realsim.app.export.target import ExportRequest
 from realsim.app.register.fixed import CALIBRATED
 from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError
@@ -211,7 +211,7 @@ def _require_scenes(source: Path, request: ExportRequest, there: list[int]) -> N
 
 def _graspnet(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
     from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.tree import open_graspnet
+    from realsim.formats.graspnet.scene import open_graspnet
 
     tree = open_graspnet(
         source,

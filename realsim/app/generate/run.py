@@ -15,7 +15,7 @@ from realsim.app.generate.request import LAYOUTS, Files, GenerateRequest, claim,
 from realsim.errors import InputError
 from realsim.pages import counted
 from realsim.store import SessionStore, atomic
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim.untrusted.own_json import noted, read_object
 from realsim_sim_bridge.synthetic.write import require_renderer, write_session
 from realsim_sim_bridge.table_scenes import sample

@@ -13,11 +13,10 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE, save_models
 from realsim.formats.bop.source import BopSource
 from realsim.formats.frame_source import FrameSource
+from realsim.formats.graspnet.cameras import CameraPlacer
 from realsim.formats.graspnet.models import what_to_give
-from realsim.formats.graspnet.placed_cameras import CameraPlacer
 from realsim.formats.imported_labels import load_imported, save_imported
-from realsim.formats.labelled_frames import LabelledFrames
-from realsim.formats.labelled_scene import LabelledScene
+from realsim.formats.labelled_scene import LabelledFrames, LabelledScene
 from realsim.records import ObjectPose
 from realsim.store import SessionStore
 

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.importing.archive import is_archive
 from realsim.app.importing.folder import describe_folder
-from realsim.app.importing.source import ImportRequest, kind_of, require_fitting
+from realsim.app.importing.source import ImportRequest, is_archive, kind_of, require_fitting
 from realsim.errors import InputError
 
 
@@ -89,9 +88,8 @@ def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
 
 
 def _graspnet_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
-    from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
-    from realsim.formats.graspnet.tree import open_graspnet
+    from realsim.formats.graspnet.opening import is_graspnet_frame, open_graspnet_frame, open_scene
+    from realsim.formats.graspnet.scene import open_graspnet
 
     rows: list[Sequence[object]] = []
     if is_graspnet_frame(root):

@@ -21,7 +21,7 @@ from realsim.errors import InputError, UnitError
 from realsim.formats.folders.listing import shown
 from realsim.formats.frame_source import FrameSource, SourceFrame
 from realsim.records import CaptureSession, View
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim.store.opening import finish_beginning
 from realsim.store.session_store import SESSION_FILE, SessionStore
 from realsim.untrusted.own_json import to_json

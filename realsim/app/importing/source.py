@@ -1,7 +1,13 @@
-"""`realsim import`: what kind of recording a path is, by its content, and opening it as such."""
+"""`realsim import`: what kind of recording a path is, by its content, and opening it as such.
 
+A data set in a zip or tar archive: unpacked for the time of its import.
+"""
+
+import contextlib
 import re
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +21,37 @@ from realsim.formats.folders.listing import ENDINGS, shown
 from realsim.formats.frame_source import FrameSource
 from realsim.store.header import SESSION_FILE
 from realsim.store.opening import CAMERA_FILE, require_header
+
+ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
+
+
+@contextlib.contextmanager
+def unpacked(source: Path, out: Path, console: Console) -> Generator[Path]:
+    """Yield what is imported; of an archive, what was in it for the time being."""
+    from realsim.untrusted.archives import extract
+
+    if not is_archive(source):
+        yield source
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    room = shutil.disk_usage(out.parent).free / 2
+    # Beside the session: there is room for the images, a system's /tmp may be small.
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as place:
+        console.say(f"{source} is an archive: unpacking it beside {out}.")
+        extract(source, Path(place) / "content", most_bytes=room)
+        yield content_of(Path(place) / "content")
+
+
+def is_archive(path: Path) -> bool:
+    """Return whether a file is a zip or tar archive, by its name."""
+    return path.is_file() and path.name.lower().endswith(ARCHIVES)
+
+
+def content_of(folder: Path) -> Path:
+    """Return what an archive holds: its only folder, or all of it."""
+    inside = [p for p in folder.iterdir() if not p.name.startswith((".", "__MACOSX"))]
+    return content_of(inside[0]) if len(inside) == 1 and inside[0].is_dir() else folder
+
 
 ROS1_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -75,7 +112,6 @@ def run_import(
     Raises:
         InputError: it is not known what it is, or it cannot be read or joined.
     """
-    from realsim.app.importing.archive import unpacked
     from realsim.app.importing.labels import labels_of, require_models
     from realsim.formats.bags.source import BagSource
 
@@ -134,7 +170,7 @@ def kinds_of(path: Path) -> dict[str, str]:
 
 def _is_graspnet(path: Path) -> bool:
     """Return whether a folder is a GraspNet data set, one of its scenes, or a scene's camera."""
-    from realsim.formats.graspnet.single_frame import is_graspnet_frame
+    from realsim.formats.graspnet.opening import is_graspnet_frame
 
     return is_graspnet_frame(path) or any(
         any(path.glob(f"{above}annotations/*.xml")) and any(path.glob(f"{above}rgb"))
@@ -259,10 +295,9 @@ def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
 
 
 def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
-    from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
-    from realsim.formats.graspnet.tree import open_graspnet
-    from realsim.formats.labelled_frames import LabelledFrames
+    from realsim.formats.graspnet.opening import is_graspnet_frame, open_graspnet_frame, open_scene
+    from realsim.formats.graspnet.scene import open_graspnet
+    from realsim.formats.labelled_scene import LabelledFrames
 
     if is_graspnet_frame(request.source):
         frame = open_graspnet_frame(request.source, models=request.models)

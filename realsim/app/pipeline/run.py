@@ -20,8 +20,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.formats.export_folder import FINISHED
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
 from realsim.store import provenance
-from realsim.store.atomic import storing, write_bytes, write_json
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in, storing, write_bytes, write_json
 from realsim.untrusted.own_json import read_object, to_json
 
 SCENES, RECORDS, LOGS = "scenes", "records", "logs"

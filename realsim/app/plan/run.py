@@ -222,7 +222,7 @@ def _source_plan(
 ) -> CapturePlan:
     """Return the plan that a file holds, or the one that a joint path makes."""
     from realsim_capture_plans.plan_files import plan_json
-    from realsim_capture_plans.plan_files.imported import plan_of_path
+    from realsim_capture_plans.plan_files.foreign_plans import plan_of_path
     from realsim_capture_plans.plan_files.joint_paths import read_path
 
     path = Path(source)
@@ -269,13 +269,13 @@ def _source_plan(
 
 def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
     """Return what writes a file of this suffix."""
-    from realsim_capture_plans.plan_files import exported
+    from realsim_capture_plans.plan_files import foreign_plans
     from realsim_capture_plans.plan_files.plan_json import save_plan
 
     writers: dict[str, Callable[[CapturePlan, Path], None]] = {
         ".json": save_plan,
-        ".csv": exported.export_csv,
-        ".script": exported.export_urscript,
+        ".csv": foreign_plans.export_csv,
+        ".script": foreign_plans.export_urscript,
     }
     suffix = dest.suffix.lower()
     if suffix in writers:
@@ -286,7 +286,7 @@ def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
 
         return one
     if not suffix and not dest.is_file():
-        return exported.export_graspnet
+        return foreign_plans.export_graspnet
     raise InputError(
         f"'{dest}' has no form that is written: .json (realsim plan), .csv (table), .script "
         "(URScript), or a folder without a suffix (GraspNet's camera_poses.npy)."
@@ -295,7 +295,7 @@ def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
 
 def _document(plan: CapturePlan, metrics: dict[str, float]) -> dict[str, object]:
     """Return what a program wants to know of a plan, for `--json`."""
-    from realsim_capture_plans.plan_files.imported import colliding_legs
+    from realsim_capture_plans.plan_files.foreign_plans import colliding_legs
 
     return {
         "kind": plan.kind,
@@ -311,7 +311,7 @@ def _document(plan: CapturePlan, metrics: dict[str, float]) -> dict[str, object]
 
 def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) -> None:
     """Print what the plan is for, and its metrics beside what is good."""
-    from realsim_capture_plans.plan_files.imported import IMPORT_MEANINGS
+    from realsim_capture_plans.plan_files.foreign_plans import IMPORT_MEANINGS
 
     meanings = METRIC_MEANINGS | IMPORT_MEANINGS
     x, y, z = plan.center_world.tolist()
@@ -352,7 +352,7 @@ def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) ->
 
 def show_colliding(plan: CapturePlan, console: Console) -> bool:
     """Name the moves that collide in the model; return whether there are none."""
-    from realsim_capture_plans.plan_files.imported import colliding_legs
+    from realsim_capture_plans.plan_files.foreign_plans import colliding_legs
 
     legs = colliding_legs(plan)
     told = [f"not free: {line}" for line in legs]

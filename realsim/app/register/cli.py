@@ -52,7 +52,7 @@ def register_command(
     from realsim.app.register.run import run_register
     from realsim.app.register.tables import as_json, show_registered
     from realsim.app.stages import open_session, session_models
-    from realsim.store.lock import only_run_in
+    from realsim.store.atomic import only_run_in
 
     session = one_session(sessions, where, whole=True)
     most = None if isinstance(views, str) else views

@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.app.stages import arm_sigma_mm
 from realsim.errors import InputError
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import number_from_json, read_values
 

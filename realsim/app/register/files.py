@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.register import results
-from realsim.app.register.results import CameraChange, Json, Registered
-from realsim.app.register.uncertainty import sigmas
+from realsim.app.register.results import CameraChange, Json, Registered, sigmas
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.json_values import json_value

@@ -12,14 +12,14 @@ from realsim.app.register.results import CameraChange, claimed_cameras
 from realsim.app.stages import require_sound
 from realsim.arrays import Array, evenly
 from realsim.errors import InputError
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.store import SessionStore
 from realsim.store.cameras import open_cameras
 from realsim.store.manifest import Manifest
 from realsim.store.session_store import depth_path
 
 if TYPE_CHECKING:
-    from realsim.registration.fixed_cameras import FixedFrames
+    from realsim.registration.views import FixedFrames
 
 CALIBRATED = "calibration/cameras/cameras.json"
 """What `realsim calibrate SESSION --cameras` says of all cameras."""
@@ -96,7 +96,7 @@ def _input(
     views: list[int],
     request: RegisterRequest,
 ) -> FixedInput:
-    from realsim.registration.fixed_cameras import FixedCamera, FixedFrames
+    from realsim.registration.views import FixedCamera, FixedFrames
 
     store, camera = stores
     bias = DepthBias.unmeasured()

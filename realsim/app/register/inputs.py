@@ -18,7 +18,7 @@ from realsim.app.stages import content_key, session_models, take_models
 from realsim.arrays import Array, Array32, evenly
 from realsim.errors import InputError, UnitError
 from realsim.records import ObjectModel, View
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.search.records import Wanted
 from realsim.store import SessionStore
 from realsim.store.manifest import Manifest

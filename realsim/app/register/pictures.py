@@ -12,7 +12,7 @@ from realsim.app.register.results import Registered
 from realsim.arrays import Array, Image, Int32, evenly
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.rendering.overlay import INK, PAPER, VERDICT_RGB, contact_sheet, draw_outlines
 from realsim.rendering.overlay_words import write_names
 from realsim.rendering.rays import BACKGROUND, PlacedMesh

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.register.results import Registered
-from realsim.app.register.uncertainty import sigmas
+from realsim.app.register.results import Registered, sigmas
 from realsim.json_values import json_value
 from realsim.records import ObjectModel, ObjectPose
 

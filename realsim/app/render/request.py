@@ -14,8 +14,7 @@ from realsim.many import Workers
 from realsim.records import CameraIntrinsics, Scene
 from realsim.rendering.depth_sensors.profiles import PROFILES
 from realsim.store import SessionStore
-from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
-from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.config import SyntheticConfig, hemisphere_cameras
 
 LARGEST_VIEWS = 100_000
 """More views than this are a typing error."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.app.console import Console, shortened
-from realsim.app.export.croissant import CROISSANT_FILE
+from realsim.app.export.card import CROISSANT_FILE
 from realsim.app.reproduce.compare import FileDifference, compare_folders
 from realsim.errors import InputError
 from realsim.store import SessionStore, provenance
@@ -191,8 +191,8 @@ def _in_session(
 
 def _export(folder: Path, request: dict[str, Any], place: Path, console: Console) -> Path:
     """Export again, from copies of the sessions; return the new folder."""
-    from realsim.app.export.request import ExportRequest
     from realsim.app.export.run import run_export
+    from realsim.app.export.target import ExportRequest
 
     copies: list[Path] = []
     for k, source in enumerate(request["sources"]):

@@ -22,7 +22,7 @@ from realsim.formats.grasps.hand_frames import hand_of_set
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import PHASES, GraspTrajectories
 from realsim.review.replaying.grasp_replay import RATE_HZ, GraspMotion, hand_approach
 from realsim.robots.hand import FRANKA, find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm

@@ -20,7 +20,7 @@ from realsim.robots.check_arm import Finding, check_arm
 from realsim.robots.hand import Hand, find_hand
 from realsim.robots.robot_files import KINDS, kind_of, names_of
 from realsim.store.atomic import write_bytes
-from realsim_capture_plans.pictures.arm_looks import shape_mesh
+from realsim_capture_plans.pictures.arm_chart import shape_mesh
 
 SIZE_PX = (420, 420)
 LINKS = ((96, 112, 128), (176, 188, 200))

@@ -105,6 +105,6 @@ def complete_command(
     NAMES are those without properties by default. Meshes and models_info.json are not changed.
     Convex parts take up to a minute of CPU time for each model.
     """
-    from realsim.app.scan.complete import run_complete
+    from realsim.app.scan.importing import run_complete
 
     return run_complete(library, names, console, mass_kg=mass, density=density)

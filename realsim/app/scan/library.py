@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import Console, shortened
-from realsim.models.library_records import ModelProperties
+from realsim.models.model_records import ModelProperties
 from realsim.records import Mesh
 
 if TYPE_CHECKING:
@@ -168,8 +168,7 @@ def run_library_check(folder: Path, console: Console) -> bool:
     Raises:
         InputError: no library, or its list of models is damaged.
     """
-    from realsim.models.library_check import check_library
-    from realsim.models.library_reading import LibraryReader
+    from realsim.models.library_reading import LibraryReader, check_library
 
     library = LibraryReader.open(folder)
     findings = check_library(library)

@@ -202,7 +202,7 @@ def export_command(
     console: Console, source: Path, target: str, out: Path, least_score: float
 ) -> None:
     """Write the grasps of SOURCE (a session, or a folder of results) for other programs."""
-    from realsim.app.school.export import export
+    from realsim.app.school.files import export
 
     files = export(source, target, out, least_score)
     console.say(*map(str, files))
@@ -217,6 +217,6 @@ def export_command(
 @options(json_file=json_file("with_trajectory", "closures", top=True))
 def summary_command(console: Console, sources: tuple[Path, ...], json_file: Path | None) -> None:
     """Sum up the results of many sessions, row by row as in the paper's table."""
-    from realsim.app.school.export import summarise
+    from realsim.app.school.files import summarise
 
     summarise(sources, json_file, console)

@@ -13,9 +13,9 @@ from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.many import Workers
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
-from realsim.robots.hand_file import STIFFEST_N_PER_M
+from realsim.robots.robot_files import STIFFEST_N_PER_M
 from realsim.store import SessionStore, atomic
 from realsim.store.opening import require_header
 

@@ -109,7 +109,7 @@ def run(source: Path, out: Path | None, request: SchoolRequest, console: Console
     Raises:
         InputError: something given cannot be used, or the folder holds results of other parameters.
     """
-    from realsim.store.lock import only_run_in
+    from realsim.store.atomic import only_run_in
 
     inputs = read_inputs(source, out, request, console)
     inputs.folder.mkdir(parents=True, exist_ok=True)

@@ -80,8 +80,7 @@ def _settled(
     Raises:
         InputError: no table, no object, one without volume, or no file of a support.
     """
-    from realsim_sim_bridge.scenes.stable_state import stable_state
-    from realsim_sim_bridge.scenes.stand_picture import stand_picture
+    from realsim_sim_bridge.scenes.stable_state import stable_state, stand_picture
     from realsim_sim_bridge.scenes.table_world import TableWorld
 
     scene = with_supports(school_scene(inputs, console), supports)

@@ -11,15 +11,14 @@ import numpy as np
 from realsim import images
 from realsim.app.annotate.current import is_annotated, what_is_stale
 from realsim.app.console import Console
-from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
+from realsim.app.export.target import ExportRequest
 from realsim.app.stages import open_session
 from realsim.app.stats import compare_files
 from realsim.arrays import Array, Int64
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
-from realsim.formats.graspnet.instances import OBJECT_LIST
-from realsim.formats.graspnet.labelled import GraspnetLabelledScene
+from realsim.formats.graspnet.labelled import OBJECT_LIST, GraspnetLabelledScene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.formats.session_scene import SessionScene
 from realsim.geometry import se3

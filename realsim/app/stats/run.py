@@ -12,8 +12,7 @@ from typing import Any
 from realsim.app.console import Console
 from realsim.app.export.sources import session_folders
 from realsim.app.stats import statistics
-from realsim.app.stats.collect import SessionFacts, session_facts
-from realsim.app.stats.statistics import Cell, Statistics
+from realsim.app.stats.statistics import Cell, SessionFacts, Statistics, session_facts
 from realsim.errors import InputError, RealsimError
 from realsim.json_values import json_value
 from realsim.many import Outcome, Sent, Task, Workers, at_most, open_pool, run_many

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from realsim.errors import InputError
 from realsim.formats.bop.scene import BopSceneRef, find_scenes
 from realsim.formats.graspnet.labelled import FIRST_TEST_SCENE, GraspnetSceneRef
+from realsim.formats.graspnet.opening import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.graspnet.scene import CAMERAS, cameras_of
-from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.many import Workers
 from realsim.store.header import SESSION_FILE

@@ -23,7 +23,7 @@ from realsim.app.upgrade.tables import show_upgrade, write_tables
 from realsim.errors import InputError
 from realsim.many import Outcome, Sent, Task, Worked, Workers, at_most, open_pool, run_many
 from realsim.review.journal import JOURNAL_FILE
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 
 
 def upgrade_scenes(
@@ -206,7 +206,7 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
     Returns:
         How the School's scores and the analytic labels go together.
     """
-    from realsim.app.upgrade.page import write_page
+    from realsim.app.upgrade.tables import write_page
 
     records = list(files.all_records(out))
     places = [str(r["place"]) for r in records]

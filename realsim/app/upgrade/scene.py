@@ -30,7 +30,7 @@ from realsim.registration.compare import spread_frames
 from realsim.registration.evidence import LazyFrame
 from realsim.registration.photo import Picture
 from realsim.store import SessionStore, provenance
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim.untrusted.own_json import read_values
 
 Record = dict[str, Any]

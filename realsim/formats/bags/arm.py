@@ -6,8 +6,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
-from realsim.formats.bags.clocks import check_overlap
-from realsim.formats.bags.joints import UR_JOINTS
+from realsim.formats.bags.joints import UR_JOINTS, check_overlap
 from realsim.formats.bags.scan import Scan
 from realsim.formats.bags.tf_tree import arm_frames
 from realsim.formats.bags.topics import BagChoice, Topics

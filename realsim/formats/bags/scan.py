@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Int64, Mask
 from realsim.errors import InputError
-from realsim.formats.bags import realsense as rs
+from realsim.formats.bags import cameras as rs
 from realsim.formats.bags import wire
 from realsim.formats.bags.joints import JointTrack
 from realsim.formats.bags.recording import Recording

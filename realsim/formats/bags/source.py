@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from realsim.arrays import UInt16
 from realsim.errors import InputError
-from realsim.formats.bags import cameras, clocks, pixels
-from realsim.formats.bags import realsense as rs
+from realsim.formats.bags import cameras, joints, pixels
+from realsim.formats.bags import cameras as rs
 from realsim.formats.bags.arm import ArmAtFrames, arm_at
 from realsim.formats.bags.joints import UR_JOINTS
 from realsim.formats.bags.pixels import counts_of, unit_of
@@ -185,11 +185,11 @@ def _joined(
         )
     _check_domains(colour, depth)
     names = (colour.topic.name, depth.topic.name)
-    clocks.check_overlap(names[0], colour.stamp_ns, names[1], depth.stamp_ns, found.clock)
+    joints.check_overlap(names[0], colour.stamp_ns, names[1], depth.stamp_ns, found.clock)
     gap = choice.max_pair_gap_s or _pair_gap_s(recording, colour, depth)
-    pairs = clocks.pairs(colour.stamp_ns, depth.stamp_ns, gap)
+    pairs = joints.pairs(colour.stamp_ns, depth.stamp_ns, gap)
     if not len(pairs):
-        near = clocks.nearest(depth.stamp_ns, colour.stamp_ns)
+        near = joints.nearest(depth.stamp_ns, colour.stamp_ns)
         least = float(np.abs(depth.stamp_ns[near] - colour.stamp_ns).min()) / NS_PER_S
         raise InputError(
             f"none of the {len(colour.stamp_ns)} images of {names[0]} has one of the "
@@ -217,8 +217,8 @@ def _pair_gap_s(recording: Recording, colour: ImageTimes, depth: ImageTimes) -> 
     periods: list[float] = []
     for times in (colour, depth):
         rate = rs.frame_rate(recording, times.topic.name)
-        periods.append(1 / rate if rate else clocks.period_s(times.stamp_ns))
-    return min(min(periods) / 2, clocks.MAX_PAIR_GAP_S)
+        periods.append(1 / rate if rate else joints.period_s(times.stamp_ns))
+    return min(min(periods) / 2, joints.MAX_PAIR_GAP_S)
 
 
 def _check_domains(colour: ImageTimes, depth: ImageTimes) -> None:

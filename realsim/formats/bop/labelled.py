@@ -18,9 +18,9 @@ from realsim.formats.bop.rows import GroundTruth, Json
 from realsim.formats.bop.run_lengths import decoded
 from realsim.formats.bop.scene import BopSceneRef
 from realsim.formats.folders.listing import shown
+from realsim.formats.frame_source import require_plausible
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
-from realsim.formats.plausible_camera import require_plausible
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json

@@ -17,7 +17,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.plausible_camera import require_plausible
+from realsim.formats.frame_source import require_plausible
 from realsim.geometry import se3
 from realsim.interop import T_from_rigid3d, opencv_from_colmap_px
 from realsim.records import CameraIntrinsics

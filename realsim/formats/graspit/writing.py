@@ -19,8 +19,13 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import GRASP_FILE, WorldGrasps
 from realsim.formats.graspit.scene import SCENE_FILE, TABLE
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes.mesh_obj import part_file
-from realsim.formats.robot_scenes.placed_scene import PlacedScene, TableBox, seen_from, unique_names
+from realsim.formats.robot_scenes.placed_scene import (
+    PlacedScene,
+    TableBox,
+    part_file,
+    seen_from,
+    unique_names,
+)
 from realsim.geometry import se3
 from realsim.geometry.mesh import box_mesh, face_normals
 from realsim.records import GraspSet, Mesh

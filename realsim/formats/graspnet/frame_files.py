@@ -13,8 +13,8 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content
 from realsim.formats.graspnet.annotations import annotation_bytes, object_fields
+from realsim.formats.graspnet.image_objects import meta_bytes
 from realsim.formats.graspnet.labelled import ENTRY, FACTOR_DEPTH, GraspnetLabelledScene
-from realsim.formats.graspnet.meta import meta_bytes
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene
 from realsim.images import png
 

@@ -8,10 +8,10 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import LARGEST_NUMBER
+from realsim.formats.graspnet.cameras import CameraPlacer
 from realsim.formats.graspnet.frame_files import own_values
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
-from realsim.formats.graspnet.placed_cameras import CameraPlacer
-from realsim.formats.graspnet.tree import CAMERAS
+from realsim.formats.graspnet.scene import CAMERAS
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, undistort

@@ -30,8 +30,7 @@ from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, npy_bytes
 from realsim.formats.graspnet.frame_files import Loss, frame_files
 from realsim.formats.graspnet.grasp_group import GraspGroup, grasp_group
 from realsim.formats.graspnet.gripper_frame import BASE_M, HEIGHT_M, graspnet_poses
-from realsim.formats.graspnet.instances import OBJECT_LIST
-from realsim.formats.graspnet.labelled import GraspnetLabelledScene
+from realsim.formats.graspnet.labelled import OBJECT_LIST, GraspnetLabelledScene
 from realsim.formats.graspnet.models import model_files
 from realsim.formats.graspnet.tried_labels import OBJECTS, told_of
 from realsim.formats.graspnet.write_plan import GraspnetWriteConfig, WritePlan, plan_scene

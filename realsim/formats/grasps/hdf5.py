@@ -29,8 +29,7 @@ from realsim.arrays import Array, Int64
 from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
 from realsim.formats.hdf5_checked import CheckedGroup, opened
 from realsim.records import STAGES, GraspSet
-from realsim.records.grasps import MEASURES
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import MEASURES, PHASES, GraspTrajectories
 from realsim.store import atomic
 
 FORMAT = "realsim grasps"

@@ -16,8 +16,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.checked_arrays import rigid
-from realsim.records.grasps import MEASURES, require_one_hand
-from realsim.records.trajectories import GraspTrajectories
+from realsim.records.grasps import MEASURES, GraspTrajectories, require_one_hand
 from realsim.untrusted.own_json import array_from_json, to_json
 
 

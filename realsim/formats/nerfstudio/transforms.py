@@ -26,7 +26,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.folders.listing import ENDINGS, image_header, natural_key, shown
 from realsim.formats.folders.posed_images import PosedImage
-from realsim.formats.plausible_camera import require_plausible
+from realsim.formats.frame_source import require_plausible
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.untrusted import json_text, values

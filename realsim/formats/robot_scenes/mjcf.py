@@ -16,7 +16,7 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes import mesh_obj
+from realsim.formats.robot_scenes import placed_scene
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
     PlacedObject,
@@ -62,11 +62,11 @@ def write_mjcf_scene(
     counts: dict[int, int] = {}
     for obj_id, name in names.items():
         body = scene.bodies[obj_id]
-        parts = mesh_obj.collision_parts(body)
+        parts = placed_scene.collision_parts(body)
         counts[obj_id] = len(parts)
         piece = f"{ASSETS}/{name}"
         if not folder.has(piece):
-            folder.write_piece(piece, mesh_obj.mesh_files(piece, body.model.mesh, parts))
+            folder.write_piece(piece, placed_scene.mesh_files(piece, body.model.mesh, parts))
         if progress is not None:
             progress()
     text = scene_xml(scene, names, counts)
@@ -117,7 +117,7 @@ def scene_xml(scene: PlacedScene, names: dict[int, str], counts: dict[int, int])
         world,
         "geom",
         {"name": TABLE_NAME, "type": "box", "size": spaced(half), **_pose(table.T_world_box)},
-        rgba=f"{spaced(mesh_obj.TABLE_RGB)} 1",
+        rgba=f"{spaced(placed_scene.TABLE_RGB)} 1",
         friction="1",
     )
     for o in scene.objects:
@@ -130,17 +130,17 @@ def _assets(assets: ET.Element, body: RigidBody, name: str, count: int) -> None:
     mesh = body.model.mesh
     material = ET.SubElement(assets, "material", name=f"{name}_surface", specular="0.2")
     if mesh.colors is None and (mesh.uv is None or mesh.texture is None):
-        material.set("rgba", f"{spaced(mesh_obj.PLAIN_RGB)} 1")
+        material.set("rgba", f"{spaced(placed_scene.PLAIN_RGB)} 1")
     else:
-        file = f"{name}/{mesh_obj.TEXTURE}"
+        file = f"{name}/{placed_scene.TEXTURE}"
         ET.SubElement(assets, "texture", name=f"{name}_texture", type="2d", file=file)
         material.set("texture", f"{name}_texture")
     # What is seen has no matter, and may be open: the inertia of a shell always exists.
     ET.SubElement(
-        assets, "mesh", name=f"{name}_visual", file=f"{name}/{mesh_obj.VISUAL}", inertia="shell"
+        assets, "mesh", name=f"{name}_visual", file=f"{name}/{placed_scene.VISUAL}", inertia="shell"
     )
     for k in range(count):
-        part = mesh_obj.part_name(k)
+        part = placed_scene.part_name(k)
         ET.SubElement(assets, "mesh", name=f"{name}_{part}", file=f"{name}/{part}.obj")
 
 
@@ -171,9 +171,9 @@ def _body(world: ET.Element, o: PlacedObject, body: RigidBody, name: str, count:
         ET.SubElement(
             element,
             "geom",
-            name=f"{o.name}_{mesh_obj.part_name(k)}",
+            name=f"{o.name}_{placed_scene.part_name(k)}",
             type="mesh",
-            mesh=f"{name}_{mesh_obj.part_name(k)}",
+            mesh=f"{name}_{placed_scene.part_name(k)}",
             friction=repr(float(body.friction)),
             priority="1",
             group=COLLIDING,

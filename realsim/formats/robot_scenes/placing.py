@@ -7,7 +7,6 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.robot_scenes.mesh_obj import convex_part
 from realsim.formats.robot_scenes.placed_scene import (
     GRAVITY,
     PlacedObject,
@@ -15,6 +14,7 @@ from realsim.formats.robot_scenes.placed_scene import (
     RigidBody,
     SceneCamera,
     TableBox,
+    convex_part,
     unique_names,
 )
 from realsim.geometry import se3

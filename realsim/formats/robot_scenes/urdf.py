@@ -12,21 +12,19 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes.mesh_obj import (
-    TABLE_RGB,
-    VISUAL,
-    collision_parts,
-    mesh_files,
-    part_name,
-)
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
+    TABLE_RGB,
+    VISUAL,
     WORLD_NAME,
     PlacedObject,
     PlacedScene,
     RigidBody,
     SceneCamera,
     TableBox,
+    collision_parts,
+    mesh_files,
+    part_name,
     spaced,
     told,
 )

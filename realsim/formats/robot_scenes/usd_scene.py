@@ -21,7 +21,7 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes import mesh_obj
+from realsim.formats.robot_scenes import placed_scene
 from realsim.formats.robot_scenes.placed_scene import (
     PlacedScene,
     RigidBody,
@@ -60,7 +60,7 @@ def body_stage(pxr: Any, body: RigidBody, name: str, texture: str) -> Any:
     _set_mass(pxr, root, body)
     labels = pxr.UsdSemantics.LabelsAPI.Apply(root, LABEL)
     labels.CreateLabelsAttr().Set([body.model.name])
-    mesh, look = body.model.mesh, mesh_obj.look_of(body.model.mesh)
+    mesh, look = body.model.mesh, placed_scene.look_of(body.model.mesh)
     visual = define_mesh(pxr, stage, f"/{name}/visual", mesh)
     if look.corner_uv is not None:
         primvar = pxr.UsdGeom.PrimvarsAPI(visual).CreatePrimvar(
@@ -73,7 +73,7 @@ def body_stage(pxr: Any, body: RigidBody, name: str, texture: str) -> Any:
     guide = pxr.UsdGeom.Scope.Define(stage, f"/{name}/collision")
     guide.CreatePurposeAttr().Set(pxr.UsdGeom.Tokens.guide)
     rubbing = friction_material(pxr, stage, f"/{name}/Looks/friction", body.friction)
-    for k, part in enumerate(mesh_obj.collision_parts(body)):
+    for k, part in enumerate(placed_scene.collision_parts(body)):
         shape = define_mesh(pxr, stage, f"/{name}/collision/part_{k:03d}", part).GetPrim()
         pxr.UsdPhysics.CollisionAPI.Apply(shape)
         approximation = pxr.UsdPhysics.MeshCollisionAPI.Apply(shape).CreateApproximationAttr()
@@ -84,7 +84,7 @@ def body_stage(pxr: Any, body: RigidBody, name: str, texture: str) -> Any:
 
 def texture_png(body: RigidBody) -> bytes | None:
     """Return the texture of a body, None if it has none."""
-    texture = mesh_obj.look_of(body.model.mesh).texture
+    texture = placed_scene.look_of(body.model.mesh).texture
     return None if texture is None else encode_png(np.ascontiguousarray(texture))
 
 
@@ -143,7 +143,7 @@ def _set_mass(pxr: Any, prim: Any, body: RigidBody) -> None:
     mass.CreatePrincipalAxesAttr().Set(pxr.Gf.Quatf(w, x, y, z))
 
 
-def _surface(pxr: Any, stage: Any, path: str, look: mesh_obj.Look, texture: str) -> Any:
+def _surface(pxr: Any, stage: Any, path: str, look: placed_scene.Look, texture: str) -> Any:
     """Define a UsdPreviewSurface with a texture, or a plain colour."""
     types, shade = pxr.Sdf.ValueTypeNames, pxr.UsdShade
     material = shade.Material.Define(stage, path)
@@ -155,7 +155,7 @@ def _surface(pxr: Any, stage: Any, path: str, look: mesh_obj.Look, texture: str)
     output = surface.CreateOutput("surface", types.Token)
     material.CreateSurfaceOutput().ConnectToSource(output)
     if look.corner_uv is None:
-        color.Set(pxr.Gf.Vec3f(*mesh_obj.PLAIN_RGB))
+        color.Set(pxr.Gf.Vec3f(*placed_scene.PLAIN_RGB))
         return material
     reader = shade.Shader.Define(stage, f"{path}/st")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
@@ -263,7 +263,7 @@ def _add_table(pxr: Any, stage: Any, table: TableBox) -> None:
     cube = pxr.UsdGeom.Cube.Define(stage, f"{ROOT}/table")
     cube.CreateSizeAttr().Set(1.0)
     cube.CreateExtentAttr().Set([(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)])
-    cube.CreateDisplayColorAttr().Set([pxr.Gf.Vec3f(*mesh_obj.TABLE_RGB)])
+    cube.CreateDisplayColorAttr().Set([pxr.Gf.Vec3f(*placed_scene.TABLE_RGB)])
     prim = cube.GetPrim()
     _place(pxr, prim, table.T_world_box)
     sides = pxr.Gf.Vec3d(*table.size_m, table.thickness_m)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim.geometry.normal_equations import System, add_prior, covariances
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.equations import BIAS, HAND_EYE, TABLE_AT, State, object_at
 from realsim.registration.views import ViewPoints

@@ -11,9 +11,9 @@ import numpy as np
 
 from realsim.arrays import Array, Array32, Mask
 from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.loss import half_occluded
 from realsim.rendering.depth_sensors.model import DepthSensorModel, depth_edges
 from realsim.rendering.depth_sensors.plane_faults import Estimate
-from realsim.rendering.depth_sensors.shadow import half_occluded
 
 REACH_PX = 24
 """A hole that is wider by more than this than the shadow beside it hides something unknown [px]."""

@@ -22,6 +22,9 @@ from realsim.rendering.depth_sensors.loss import (
     blob_mask,
     cosine_of_view,
     grazing_loss,
+    half_occluded,
+    require_same_size,
+    shadow_mask,
     signal_loss,
 )
 from realsim.rendering.depth_sensors.noise import (
@@ -33,7 +36,6 @@ from realsim.rendering.depth_sensors.noise import (
     whole_pixel,
 )
 from realsim.rendering.depth_sensors.profiles import DepthProfile, SensorRecord, profile
-from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
 from realsim.rendering.rays import RayScene
 
 ASSUMED_BY_PATTERN: dict[str, dict[str, float]] = {

@@ -13,7 +13,7 @@ from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.shadow import require_same_size
+from realsim.rendering.depth_sensors.loss import require_same_size
 from realsim.rendering.depth_sensors.statistics import require_metres
 
 BENT_SHARE = 0.35

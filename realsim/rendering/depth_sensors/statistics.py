@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.shadow import require_same_size
+from realsim.rendering.depth_sensors.loss import require_same_size
 
 WINDOW_PX = 9
 """Side of the small planes [px]."""

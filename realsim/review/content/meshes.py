@@ -74,9 +74,8 @@ def within_budget(mesh: Mesh, config: SceneConfig) -> Mesh:
     budget = config.most_textured_triangles if textured else config.most_triangles
     if len(mesh.faces) <= budget:
         return mesh
-    from realsim.models.mesh_clustering import clustered
     from realsim.models.mesh_topology import topology
-    from realsim.models.simplify import simplified
+    from realsim.models.simplify import clustered, simplified
 
     few = clustered(topology(mesh), budget, CELL_SHARE)
     try:

@@ -13,7 +13,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.errors import InputError, RealsimError
 from realsim.records import Scene
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (

@@ -17,7 +17,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim.records.depth_bias import DepthBias
+from realsim.records.calibration import DepthBias
 from realsim.registration import near_start, verify
 from realsim.registration.blind import keep_start, nearest_to_start, uncertainty
 from realsim.registration.body import Body, make_body

@@ -21,7 +21,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.records.checked_arrays import freeze, frozen
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.review.replaying.grasp_words import escaped
 from realsim.review.replaying.replay_nodes import ReplayNodes
 from realsim.robots.hand import Hand, find_hand

@@ -26,17 +26,17 @@ from realsim.review.journal import Entry
 from realsim.review.refusals import SessionGone, disk_words
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
-from realsim.review.window.browser import Browser
-from realsim.review.window.camera_stand import Standpoint
-from realsim.review.window.gui_values import forget_callbacks, refuse_foreign_values
-from realsim.review.window.hands import Hands
-from realsim.review.window.keys import bind_keys
+from realsim.review.window.browser import Browser, Standpoint
+from realsim.review.window.from_browser import (
+    Hands,
+    bind_keys,
+    forget_callbacks,
+    refuse_foreign_values,
+)
 from realsim.review.window.panel_correct import CorrectPanel
 from realsim.review.window.panel_grasps import GraspsPanel
-from realsim.review.window.panel_list import ListPanel
-from realsim.review.window.panel_object import ObjectPanel
-from realsim.review.window.panel_show import ShowPanel
 from realsim.review.window.panel_views import PhotographLink, ViewsPanel
+from realsim.review.window.panels import ListPanel, ObjectPanel, ShowPanel
 
 if TYPE_CHECKING:
     from realsim.review.server import ReviewServer

@@ -15,10 +15,15 @@ from realsim.errors import DegenerateError, InputError
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.bundle import point_covariances, reprojection_errors, robust_sigma
 from realsim.scanning.sfm.config import SfmConfig
-from realsim.scanning.sfm.database import build_database, match_pairs, pairs_to_match
+from realsim.scanning.sfm.database import (
+    Photographs,
+    build_database,
+    checked_photographs,
+    match_pairs,
+    pairs_to_match,
+)
 from realsim.scanning.sfm.judging import depth_scale, judge, shown
 from realsim.scanning.sfm.mapping import geometry_of
-from realsim.scanning.sfm.photographs import Photographs, checked_photographs
 from realsim.scanning.sfm.result import Geometry, Matching, Poses, Progress, SfmResult
 from realsim.scanning.sfm.ways import LEAST_IN_VIEW, MODEL, Job, Mapped, map_at_poses, map_free
 

@@ -15,8 +15,7 @@ from realsim.scanning.sfm import mapping
 from realsim.scanning.sfm.alignment import align_to_robot, tested_freely, tested_refined
 from realsim.scanning.sfm.bundle import Bundle, adjust, halves, prior_sigmas, reliability
 from realsim.scanning.sfm.config import SfmConfig
-from realsim.scanning.sfm.database import MatchDatabase
-from realsim.scanning.sfm.photographs import Photographs
+from realsim.scanning.sfm.database import MatchDatabase, Photographs
 from realsim.scanning.sfm.result import Alignment, Poses, Progress
 
 MODEL = "model"

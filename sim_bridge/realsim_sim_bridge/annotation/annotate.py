@@ -40,7 +40,7 @@ from realsim_sim_bridge.annotation.files import (
     grasps_in_view,
     surface_path,
 )
-from realsim_sim_bridge.annotation.frame_maps import map_files
+from realsim_sim_bridge.annotation.frame_labels import map_files
 from realsim_sim_bridge.annotation.inputs import (
     FORMAT_VERSION,
     FrameInputs,

@@ -40,8 +40,7 @@ from realsim.rendering.labels import LabelRenderer, Labels
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.annotation.config import MAPS, SightConfig
-from realsim_sim_bridge.annotation.frame_labels import FrameLabel
-from realsim_sim_bridge.annotation.frame_maps import map_path
+from realsim_sim_bridge.annotation.frame_labels import FrameLabel, map_path
 from realsim_sim_bridge.annotation.inputs import FORMAT_VERSION, FrameInputs, FrameView
 from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion
 

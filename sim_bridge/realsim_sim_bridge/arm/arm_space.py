@@ -21,8 +21,13 @@ from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.compiled_chain import ChainNumbers, frames_into
-from realsim_sim_bridge.arm.grasping_arm import GraspingArm
-from realsim_sim_bridge.arm.link_spheres import Spheres, arm_spheres, hand_spheres, joined
+from realsim_sim_bridge.arm.grasping_arm import (
+    GraspingArm,
+    Spheres,
+    arm_spheres,
+    hand_spheres,
+    joined,
+)
 from realsim_sim_bridge.arm.obstacles import Obstacles, least_distance, nearest_within
 
 FREE, IN_TABLE, IN_ITSELF, AT_LIMITS = -1, -2, -3, -4

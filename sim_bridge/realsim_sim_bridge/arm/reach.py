@@ -13,16 +13,15 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.trajectories import GraspTrajectories
+from realsim.records.grasps import GraspTrajectories
 from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm import stage_motion
 from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, in_words
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import connect
-from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.reach_config import ReachConfig, base_on_table, home_joints
-from realsim_sim_bridge.arm.swept_hand import first_touched
+from realsim_sim_bridge.arm.straight_moves import first_touched, touched_when_lifted
 from realsim_sim_bridge.arm.timing import timed_path
 from realsim_sim_bridge.grasping.candidates import Surroundings
 from realsim_sim_bridge.grasping.hand_free import lowest_corner

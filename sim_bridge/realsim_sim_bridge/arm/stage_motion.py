@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from realsim.arrays import Array, Int64, Mask, Rows
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.timing import (
     TimingConfig,

@@ -31,7 +31,7 @@ import numpy as np
 from realsim import interop
 from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
-from realsim.records.trajectories import PHASES, GraspTrajectories
+from realsim.records.grasps import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in_shape

@@ -19,7 +19,7 @@ from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.demonstrations.records import DemonstrationCamera

@@ -22,9 +22,8 @@ from realsim.rendering.photo import Lighting
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.robots.arm import RobotArm, find_arm
 from realsim.robots.hand import FRANKA, Hand
-from realsim.robots.link_shapes import LARGEST_MM_SCALE
-from realsim_sim_bridge.arm.grasping_arm import GraspingArm
-from realsim_sim_bridge.arm.link_spheres import solid_points
+from realsim.robots.shapes import LARGEST_MM_SCALE
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm, solid_points
 from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion
 from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
 

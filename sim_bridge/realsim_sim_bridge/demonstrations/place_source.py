@@ -17,7 +17,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.checked_arrays import rows_of
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm.timing import trapezoid, trapezoid_share
 from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion, fall

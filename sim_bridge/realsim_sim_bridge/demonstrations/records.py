@@ -7,7 +7,7 @@ from typing import Any
 from realsim.arrays import Array, Rgb
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim.rendering.moving_scene import MovingPicture
 from realsim_sim_bridge.demonstrations.placing import PlaceGoal
 

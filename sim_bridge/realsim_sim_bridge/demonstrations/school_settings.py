@@ -11,7 +11,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import convex_parts
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel
 from realsim.robots.hand import Hand, hand_of_json
 from realsim_sim_bridge.school.config import SchoolConfig

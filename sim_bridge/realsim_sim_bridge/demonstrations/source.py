@@ -21,7 +21,7 @@ from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import ObjectModel
 from realsim.records.grasps import LABEL_MEASURES
 from realsim.untrusted.own_json import to_json
@@ -38,7 +38,7 @@ from realsim_sim_bridge.demonstrations.front_view import (
 from realsim_sim_bridge.demonstrations.pictures import AttemptPictures, ScenePictures, drawn_mesh
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
-from realsim_sim_bridge.school.object_slips import stand_of
+from realsim_sim_bridge.school.shards import stand_of
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody

@@ -26,7 +26,7 @@ from realsim_sim_bridge.hold.calibration import (
     shipped,
 )
 from realsim_sim_bridge.hold.draws import PALM_M, GraspedObject, HoldConfig, chance_columns
-from realsim_sim_bridge.school.object_slips import stand_of
+from realsim_sim_bridge.school.shards import stand_of
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test

@@ -17,10 +17,10 @@ from realsim.formats.graspit.scene import (
 )
 from realsim.formats.graspnet.cameras import POSES
 from realsim.formats.graspnet.models import require_meshes
+from realsim.formats.graspnet.opening import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.graspnet.scene import GraspnetScene, cameras_of, read_graspnet_scene
-from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.geometry import se3
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.opening import CAMERA_FILE
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, known_solids

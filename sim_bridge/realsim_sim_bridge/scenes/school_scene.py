@@ -9,7 +9,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, convex_parts
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, Scene, names_of
 

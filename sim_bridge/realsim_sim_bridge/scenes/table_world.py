@@ -17,7 +17,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, convex_parts
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import ObjectPose
 from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in_shape, require_taken, settings_in

@@ -13,10 +13,18 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
 from realsim.many import Outcome, Pool, Sent, Task, WorkerDiedError, run_many
 from realsim.models.convex import convex_parts
-from realsim_sim_bridge.school import kept_sets
-from realsim_sim_bridge.school.object_slips import in_words, result_of, stand_of
+from realsim_sim_bridge.school import cache_folder
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, prepare, trial_of, untried
-from realsim_sim_bridge.school.shards import Tested, read_tested, run_shard, shards_of, write_tested
+from realsim_sim_bridge.school.shards import (
+    Tested,
+    in_words,
+    read_tested,
+    result_of,
+    run_shard,
+    shards_of,
+    stand_of,
+    write_tested,
+)
 from realsim_sim_bridge.slip.stand import Stand
 
 Progress = Callable[[int, int], None]
@@ -30,7 +38,7 @@ class Pupil:
     folder: Path | None
     """Where its files are kept; None = nowhere."""
     shard_grasps: int
-    result: kept_sets.SchoolResult | None = None
+    result: cache_folder.SchoolResult | None = None
     prepared: Prepared | None = None
     shards: list[Rows] = field(default_factory=list[Rows])
     tested: list[Tested] = field(default_factory=list[Tested])
@@ -42,10 +50,10 @@ class Pupil:
     def __post_init__(self) -> None:
         """Take from the folder whatever has been done before."""
         path = self.path("grasps")
-        self.result = None if path is None else kept_sets.read_result(path)
+        self.result = None if path is None else cache_folder.read_result(path)
         path = self.path("prepared")
         if self.result is None and path is not None:
-            prepared = kept_sets.read_prepared(path)
+            prepared = cache_folder.read_prepared(path)
             if prepared is not None:
                 self._divide(prepared)
 
@@ -90,7 +98,7 @@ class Pupil:
         """Keep the preparation and divide the grasps into shards."""
         path = self.path("prepared")
         if path is not None and keep:
-            kept_sets.write_prepared(path, prepared)
+            cache_folder.write_prepared(path, prepared)
         self._divide(prepared)
 
     def _divide(self, prepared: Prepared) -> None:
@@ -161,7 +169,7 @@ class Pupil:
         path = self.path("grasps")
         if path is None or self.given_up:
             return
-        kept_sets.write_result(path, self.result)
+        cache_folder.write_result(path, self.result)
         for piece in [self.path("prepared"), *(self._shard_path(rows) for rows in self.shards)]:
             if piece is not None:
                 piece.unlink(missing_ok=True)

@@ -14,9 +14,9 @@ from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 from realsim.geometry.mesh import MassProperties, mass_properties
 from realsim.models.convex import convex_parts
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import Mesh
-from realsim.records.trajectories import GraspTrajectories
+from realsim.records.grasps import GraspTrajectories
 from realsim_sim_bridge.arm.reach import Reach, ReachTask, check_reach
 from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels, select_rows

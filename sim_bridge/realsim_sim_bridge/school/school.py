@@ -10,14 +10,19 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.many import ClusterLostError, Workers, open_pool
-from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
 from realsim_sim_bridge.grasping.surroundings import standing_object, together
+from realsim_sim_bridge.school.cache_folder import (
+    Restart,
+    SchoolResult,
+    folder_of_run,
+    mark_finished,
+    run_record,
+)
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Progress, Pupil, so_far
-from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask
-from realsim_sim_bridge.school.run_record import Restart, folder_of_run, mark_finished, run_record
 from realsim_sim_bridge.school.shards import default_shard_grasps
 
 P = ParamSpec("P")

@@ -25,7 +25,7 @@ from realsim.geometry.mesh_shape import MassProperties
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand
-from realsim.robots.hand_file import STIFFEST_N_PER_M
+from realsim.robots.robot_files import STIFFEST_N_PER_M
 from realsim_sim_bridge.slip.stand import Stand
 
 # --- An object as the physics engines need it ----------------------------------------------------

@@ -32,7 +32,7 @@ from realsim import images
 from realsim.arrays import Array, UInt8, UInt16
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.winding import solid_angle_share
+from realsim.geometry.distance_field import solid_angle_share
 from realsim.interop import offer
 from realsim.many import Outcome, Shared, Task, Workers, at_most, open_pool, run_many
 from realsim.records import CameraIntrinsics, GraspSet, View
@@ -40,7 +40,7 @@ from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
-from realsim.store.lock import only_run_in
+from realsim.store.atomic import only_run_in
 from realsim_sim_bridge.annotation.annotate import annotate
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.summary import AnnotationSummary

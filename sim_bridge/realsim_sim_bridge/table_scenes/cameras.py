@@ -9,7 +9,7 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
+from realsim_sim_bridge.synthetic.config import hemisphere_cameras
 
 RANGES: dict[str, tuple[float, float]] = {"far": (1.0, 2.0), "d405": (0.25, 0.50)}
 """Distances by name [m]: the paper's, and the one a D405 is made for."""

@@ -13,8 +13,8 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.models.library_records import KnownSolid
 from realsim.models.mesh_topology import open_edges
+from realsim.models.model_records import KnownSolid
 from realsim.models.properties import physical_properties
 from realsim.records import ObjectModel
 from realsim_sim_bridge.slip.world import SlipBody

@@ -16,7 +16,7 @@ from realsim.geometry import se3
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj
 from realsim.models.library_prepare import convex_note
-from realsim.models.library_records import KnownSolid, ModelProperties, ScaleNote
+from realsim.models.model_records import KnownSolid, ModelProperties, ScaleNote
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh

@@ -16,7 +16,7 @@ from realsim.geometry.colors import srgb_decoded
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.embedded.materials import PLAIN_COLORS
-from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
+from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, variant
 from realsim.rendering.photoreal.renderer import denoised
 from realsim.rendering.rays import PlacedMesh
 from refusals import refused
@@ -133,7 +133,7 @@ def verdicts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The search begins from nothing: no library named, no verdict kept."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
-    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    variant._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
     return tmp_path / "cache" / "realsim" / "llvm_libraries.json"
 
 
@@ -213,17 +213,17 @@ def test_libraries_that_cannot_work_are_named_with_the_reason(
 def test_a_verdict_is_kept_until_the_library_changes(
     tmp_path: Path, verdicts: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(llvm_probe, "_try_out", lambda library: "it ended")
+    monkeypatch.setattr(variant, "_try_out", lambda library: "it ended")
     library = tmp_path / "libLLVM.so.21.0"
     library.write_bytes(b"not a library")
     patterns = (f"{tmp_path}/libLLVM*.so*",)
     assert find_llvm(patterns).library is None
     kept = json.loads(verdicts.read_text())
     verdicts.write_text(json.dumps(dict.fromkeys(kept, "")))  # as if it had worked
-    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    variant._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
     assert find_llvm(patterns).library == library
     library.write_bytes(b"another file")
-    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    variant._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
     assert find_llvm(patterns).library is None
 
 
@@ -231,7 +231,7 @@ def test_llvm_asked_for_and_not_there_is_an_error_that_offers_the_other(
     tmp_path: Path, verdicts: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
-    monkeypatch.setattr(llvm_probe, "library_patterns", lambda: (f"{tmp_path}/libLLVM*.so*",))
+    monkeypatch.setattr(variant, "library_patterns", lambda: (f"{tmp_path}/libLLVM*.so*",))
     told, config = "'llvm' was asked for.*libllvm19.*'scalar'", PhotorealConfig(variant="llvm")
     refused(told, PhotorealRenderer, [], SKY, config)
     assert not verdicts.exists()

@@ -23,7 +23,7 @@ from realsim_sim_bridge.demonstrations.records import ALL_PHASES
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school import run_school_results
-from realsim_sim_bridge.school.object_slips import stand_of
+from realsim_sim_bridge.school.shards import stand_of
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from refusals import refused

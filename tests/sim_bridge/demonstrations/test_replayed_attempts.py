@@ -9,7 +9,7 @@ import pytest
 from realsim.app.school.files import stored_grasps
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim.records.trajectories import PHASES
+from realsim.records.grasps import PHASES
 from realsim_sim_bridge.demonstrations.front_view import FINGERS_M, FrontView, wrist_camera
 from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource

@@ -22,8 +22,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore, load_scene
-from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
-from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.config import SyntheticConfig, hemisphere_cameras
 from realsim_sim_bridge.synthetic.write import cameras_inside, write_session
 from refusals import refused
 from shared_sessions import copy_of

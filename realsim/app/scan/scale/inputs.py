@@ -19,8 +19,7 @@ from realsim.scanning.scale.result import Similarity
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
-    from realsim.models.library_records import ScanSource
-    from realsim.models.model_records import UpAxis
+    from realsim.models.model_records import ScanSource, UpAxis
     from realsim.scanning.scale.config import ScaleConfig
 
 LEAST_VIEWS = 3

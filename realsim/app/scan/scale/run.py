@@ -27,7 +27,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.json_values import json_value
-from realsim.models.library_records import ScaleNote
+from realsim.models.model_records import ScaleNote
 from realsim.records import Mesh, View
 from realsim.scanning.scale.files import (
     ScaleRecord,
@@ -43,7 +43,7 @@ from realsim.untrusted.own_json import to_json
 
 if TYPE_CHECKING:
     from realsim.models.library import ModelLibrary
-    from realsim.models.library_records import LibraryModel
+    from realsim.models.model_records import LibraryModel
 
 
 FILE = "scale.json"
@@ -90,7 +90,7 @@ def write_result(place: Place, record: ScaleRecord, named: NamedMesh, store: Ses
 
     First it stands there without its inputs: the folder is this command's, and not finished.
     """
-    from realsim.app.scan.scale.page import page_bytes
+    from realsim.app.scan.scale.show import page_bytes
 
     box_mm = 1e3 * record.fit.scale * smallest_box(named.mesh)
     place.write(FILE, result_bytes(replace(record, inputs={}), box_mm))

@@ -1,6 +1,9 @@
-"""A scale in words: the verdict first, then the figures, what limits them, and the worst views."""
+"""A scale in words: the verdict first, then the figures, what limits them, and the worst views.
 
-from collections.abc import Sequence
+The page of one scale: verdict, figures and pictures in one file that prints well.
+"""
+
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +11,9 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.scan.scale.inputs import LIBRARY, NamedMesh
 from realsim.arrays import Array
+from realsim.pages import VERDICT_KIND, Page
 from realsim.records import Verdict
+from realsim.scanning.scale.files import ScaleRecord
 from realsim.scanning.scale.measured import LengthScale
 from realsim.scanning.scale.measured_check import MeasuredCheck
 from realsim.scanning.scale.picture_overlays import worst_views
@@ -194,3 +199,77 @@ def show_measured(
     ]
     rows += [[e.measurement.text, f"{e.scale:.6g} m per unit"] for e in each]
     console.table(f"Scale of {name}", ["figure", "value"], rows)
+
+
+CAPTIONS: dict[str, tuple[str, str]] = {
+    "residuals.png": (
+        "Where the real surface lies",
+        "Blue: the real surface is inside of the model; red: outside. One colour all over is a "
+        "scale that is off; patches are the shape.",
+    ),
+    "overlays.png": (
+        "The model in the photographs",
+        "Outline of the scaled model, and beside it the model's depth minus the measured one.",
+    ),
+    "views.png": (
+        "Agreement of every view",
+        "A view that stands out has a bad camera pose, or something stands in its way.",
+    ),
+    "candidates.png": (
+        "Other scales that were looked at",
+        "A point of another scale as high as the result means that the shape allows both.",
+    ),
+}
+"""Title and caption of every picture, in the order of the page."""
+
+
+def page_bytes(
+    record: ScaleRecord, pictures: Mapping[str, bytes], folder: Path, box_mm: Array
+) -> bytes:
+    """Return the page.
+
+    Args:
+        record: what was found.
+        pictures: file name -> PNG; those that are missing are left out.
+        folder: where the pictures lie.
+        box_mm: (3,) the smallest box around the scaled mesh [mm].
+    """
+    fit = record.fit
+    name = str(record.inputs.get("mesh", {}).get("name", "mesh"))
+    session = str(record.inputs.get("session", {}).get("name", ""))
+    page = Page(
+        title=f"Scale of {name}",
+        about=f"session {session}, {len(fit.views)} views" if session else "",
+    )
+    page.verdict(
+        VERDICT_KIND[fit.verdict], fit.verdict.upper(), f"– {MEANING[fit.verdict]}",
+        [[reason] for reason in fit.reasons],
+    )  # fmt: skip
+    page.section("The scale")
+    page.table(["figure", "value"], scale_rows(fit, box_mm))
+    for note in fit.notes:
+        page.text(note, "note")
+    if fit.limits:
+        page.section(limits_title(fit), "Each alone, as a 1-sigma of the scale.")
+        page.table(["limit", "alone", "why"], limit_rows(fit))
+    if record.measured:
+        page.section("Measured by hand", "Against the fit without them.")
+        page.table(MEASURED_HEADER, measured_rows(record.measured))
+        for c in record.measured:
+            if c.agrees:
+                page.text(c.text)
+    for file, (title, caption) in CAPTIONS.items():
+        if file in pictures:
+            page.section(title)
+            page.picture((folder / file).read_bytes(), caption)
+    page.section("Views")
+    page.table(VIEW_HEADER, view_rows(fit, worst=None))
+    if fit.checks:
+        page.section("Checks without ground truth")
+        page.table(["check", "value"], [[k, f"{v:.4g}"] for k, v in fit.checks.items()])
+    page.section("What it was made from")
+    rows = [["mesh", record.inputs.get("mesh", {}).get("where", "")],
+            ["session", session], ["hash of all inputs", record.inputs.get("key", "")],
+            *[[k, v] for k, v in record.versions.items()]]  # fmt: skip
+    page.table(["input", "value"], rows)
+    return page.encode()

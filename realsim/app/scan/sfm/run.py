@@ -80,7 +80,7 @@ def sfm_inputs(request: SfmRequest) -> SfmInputs:
     Raises:
         InputError: no images, or a session whose poses are needed and missing.
     """
-    from realsim.scanning.sfm.photographs import photographs_in
+    from realsim.scanning.sfm.database import photographs_in
 
     if (request.images / "session.json").is_file():
         return _session_inputs(request)
@@ -275,10 +275,10 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.scanning.sfm.files import result_json, write_result
-    from realsim.scanning.sfm.photographs import images_digest
+    from realsim.scanning.sfm.database import images_digest
     from realsim.scanning.sfm.pictures import write_pictures
-    from realsim.store.lock import only_run_in
+    from realsim.scanning.sfm.result import result_json, write_result
+    from realsim.store.atomic import only_run_in
 
     inputs = sfm_inputs(request)
     if request.dense and not inputs.has_depth:

@@ -2,19 +2,35 @@
 
 Viser takes every value that is sent. Here it is looked at before, so that no control ever holds a
 choice that it does not offer, and no panel has to ask.
+
+What comes from one browser: done in its order, and told to the page, which waits for it.
+
+The keys of the review page.
+
+W A S D Q E and the arrows move the browser's camera, so none of them is taken. Keys do nothing
+while a text is being written.
 """
 
+import contextlib
 import logging
 import math
+import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import viser
 
 from realsim.errors import InputError
 from realsim.local_pages import refuse_uploads
+from realsim.review.placing.placing import Axis, Kind
 from realsim.review.replaying.grasp_words import one_line
+
+if TYPE_CHECKING:
+    from realsim.review.window.window import Window
+
 
 log = logging.getLogger(__name__)
 MOST_TEXT = 20_000
@@ -129,3 +145,121 @@ def _is_finite(value: float) -> bool:
 def _short(value: object) -> str:
     text = one_line(str(value))
     return f"'{text[:SHOWN_TEXT]}...'" if len(text) > SHOWN_TEXT else f"'{text}'"
+
+
+TOLD = '<i data-realsim-hands="{client}/{received}" data-at-work="{at_work}"></i>'
+"""What `page.js` reads: it hands on the next key or click when nothing is at work."""
+
+
+class Hands:
+    """Keys and clicks of a browser, one after the other."""
+
+    def __init__(self, window: "Window") -> None:
+        """Take whose they are; nothing has come yet.
+
+        Args:
+            window: of the browser.
+        """
+        self._window = window
+        self._work, self._lock = ThreadPoolExecutor(1), threading.Lock()
+        self._html = window.client.gui.add_html("")
+        self._received = self._done = 0
+
+    def do(self, action: Callable[[], object]) -> None:
+        """Do something after what came before it."""
+
+        def work() -> None:
+            try:
+                self._window.attempt(action)
+                self._window.attempt(self._window.photographs.tell)
+            finally:  # the page waits for it
+                with self._lock:
+                    self._done += 1
+                    self._tell()
+
+        with self._lock, contextlib.suppress(RuntimeError):  # the browser is gone
+            self._work.submit(work)
+            self._received += 1
+            self._tell()
+
+    def close(self) -> None:
+        """Do no more."""
+        self._work.shutdown(wait=False, cancel_futures=True)
+
+    def _tell(self) -> None:
+        if self._window.stands:
+            self._html.content = TOLD.format(
+                client=self._window.client.client_id,
+                received=self._received,
+                at_work=self._received - self._done,
+            )
+
+
+Letter = Literal[
+    "H", "N", "P", "Y", "X", "Z", "M", "V", "B", "T", "C", "F", "J", "L", "K", "I", "O", "U"
+]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key and what it does."""
+
+    key: Letter
+    words: str
+    act: Callable[["Window"], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A key that moves the object along an axis; with Shift it turns it about the axis."""
+
+    key: Letter
+    axis: Axis
+    sign: int
+
+
+KEYS = (
+    Key("N", "Next undecided object", lambda w: w.next_undecided(1)),
+    Key("P", "Previous undecided object", lambda w: w.next_undecided(-1)),
+    Key("Y", "Accept the object", lambda w: w.object.decide("accept")),
+    Key("X", "Reject the object", lambda w: w.object.decide("reject")),
+    Key("Z", "Undo the last line on the object", lambda w: w.object.undo()),
+    Key("M", "Correct the object", lambda w: w.correct.begin()),
+    Key("V", "Save the pose", lambda w: w.correct.save()),
+    Key("B", "Put the object back", lambda w: w.correct.put_back()),
+    Key("T", "Snap by ICP", lambda w: w.correct.snap()),
+    Key("C", "Show the chosen view's photograph", lambda w: w.views.show_chosen()),
+    Key("F", "Look at the object", lambda w: w.stand.look_at_object()),
+    Key("H", "Look at the whole scene", lambda w: w.stand.first_look()),
+)
+STEPS = (
+    Step("J", "x", -1),
+    Step("L", "x", 1),
+    Step("K", "y", -1),
+    Step("I", "y", 1),
+    Step("O", "z", -1),
+    Step("U", "z", 1),
+)
+WAYS: tuple[tuple[Kind, Literal["shift"] | None], ...] = (("move", None), ("turn", "shift"))
+
+
+def bind_keys(window: "Window") -> None:
+    """Give one browser its keys; Ctrl+K lists them."""
+    add = window.client.gui.add_command
+    for key in KEYS:
+        handle = add(key.words, hotkey=key.key, icon=viser.Icon.KEYBOARD)
+        handle.on_trigger(_doing(window, key.act))
+    for step in STEPS:
+        mark = "+" if step.sign > 0 else "\u2212"
+        for kind, modifier in WAYS:
+            words = f"{kind.capitalize()} the object: {mark}{step.axis}"
+            handle = add(words, hotkey=step.key, modifier=modifier, icon=viser.Icon.KEYBOARD)
+            handle.on_trigger(_doing(window, _nudging(step, kind)))
+
+
+def _doing(window: "Window", act: Callable[["Window"], object]) -> Callable[[Any], None]:
+    return window.guarded(lambda _: act(window))
+
+
+def _nudging(step: Step, kind: Kind) -> Callable[["Window"], object]:
+    return lambda window: window.correct.nudge(step.axis, step.sign, kind)
