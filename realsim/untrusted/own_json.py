@@ -76,7 +76,8 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
         if "missing" in told and " - at `" not in told and isinstance(data, dict):
             told += f"; it has: {', '.join(map(str, data)) or 'nothing'}"
         if (names := "unknown field" in told) or "enum value" in told:
-            at = told.partition(" - at `")[2].strip("`$").rpartition(".")[2].partition("[")[0]
+            at = told.partition(" - at `")[2].replace("[...]", "").strip("`$")
+            at = at.rpartition(".")[2].partition("[")[0]
             told += f"; accepted: {', '.join(map(str, _words(type_info(kind), at, names)))}"
         raise InputError(f"{what}: {told[:1].lower()}{told[1:500]}.") from error
     except InputError as error:  # a record's own check

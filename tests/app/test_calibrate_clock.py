@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 
 import refusals
-from realsim.app.calibrate.session import (
-    arm_at,
-    clock_option,
-    is_stream,
-    mend_views,
-    pair_pose_logs,
-)
+from realsim.app.calibrate.clock import arm_at, clock_option, is_stream, mend_views, pair_pose_logs
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.geometry import se3

@@ -345,7 +345,7 @@ def _from_logs(
     request: FolderRequest, console: Console
 ) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
     """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
-    from realsim.app.calibrate.session import pair_pose_logs
+    from realsim.app.calibrate.clock import pair_pose_logs
     from realsim_calibration.inputs.pose_file import read_pose_file
     from realsim_calibration.inputs.readings import reading_from_text
 
