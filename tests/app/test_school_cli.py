@@ -282,7 +282,7 @@ def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> No
     assert "--out" in refused(pristine, *QUICK, "--out", tmp_path)
     assert "is a session" in refused(tmp_path, *QUICK, "--out", pristine)
     assert "scene" in refused(tmp_path, *QUICK, "--out", tmp_path / "o")
-    assert "no grasps yet" in refused("export", pristine, "--to", "hdf5", "--out", tmp_path / "o")
+    assert "has no grasps" in refused("export", pristine, "--to", "hdf5", "--out", tmp_path / "o")
     assert "no results" in refused("summary", tmp_path)
 
 

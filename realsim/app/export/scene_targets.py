@@ -78,15 +78,13 @@ def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Written
 
 def _grasp_groups(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     """Write the grasps of every frame in its camera, as graspnetAPI's GraspGroup."""
+    from realsim.app.school.files import no_grasps
     from realsim.formats.graspnet.grasp_group import grasp_group, grasp_group_files
 
     session, inner = session_of(scene), folder.below(job.place.name)
     grasps = session.grasps()
     if grasps is None:
-        raise InputError(
-            f"session '{session.store.folder}' has no grasps yet: run `realsim school "
-            f"{session.store.folder}`."
-        )
+        raise no_grasps(session.store.folder)
     written, count = 0, 0
     for index in session.indices:
         frame = session.frame(index)

@@ -154,17 +154,27 @@ def _of_session(folder: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
     """Return the grasps of a session, from the sets themselves."""
     from realsim.app.stages import judged_scene, open_session, session_models
     from realsim.store import load_grasps
+    from realsim.store.results import grasps_on
     from realsim.store.trajectories import load_trajectories
 
     store = open_session(folder)
-    sets = load_grasps(store)
+    scene = judged_scene(store)
+    sets = grasps_on(scene, load_grasps(store))
     if not sets:
-        raise InputError(f"session '{folder}' has no grasps yet: run `realsim school {folder}`.")
+        raise no_grasps(folder)
     models = session_models(store)
     attempts = {s.instance: load_trajectories(store, s) for s in sets}
     known = {i: a for i, a in attempts.items() if a is not None}
     names = {i: m.name for i, m in models.items()}
-    return _together(judged_scene(store), sets, names, known), models
+    return _together(scene, sets, names, known), models
+
+
+def no_grasps(session: Path) -> InputError:
+    """Return the error for a session without grasps of the objects that stand there."""
+    return InputError(
+        f"session '{session}' has no grasps of its objects: run `realsim school {session}`, with "
+        "--restart if its grasps are of objects that are others now."
+    )
 
 
 M_PER_MM = 1e-3

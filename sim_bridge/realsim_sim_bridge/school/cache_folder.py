@@ -261,7 +261,7 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
         moved = ""
         if numbers:
             which = ", ".join(str(int(n)) for n in sorted(numbers))
-            moved = f" Objects were moved or exchanged since (instance {which})."
+            moved = f" Objects, or what is around them, were moved or exchanged (instance {which})."
         raise InputError(
             f"{folder} holds a run that was started with something else.{moved}{told}\n{remedy}"
         )
