@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+import refusals
 import typed_commands
 from begun_sessions import begun
 from file_trees import bytes_of
@@ -18,7 +19,6 @@ from realsim.app.calibrate.run import require_no_bag
 from realsim.app.calibrate.session import keep_board
 from realsim.app.register.files import write_result
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, HandEye, TagBoard, View
 from realsim.store import SessionStore, load_hand_eye, save_hand_eye
@@ -126,10 +126,9 @@ def test_with_objects_the_same_command_says_the_same_and_places_their_cameras(
 def refused(folder: Path, *options: str) -> str:
     """Calibrate what cannot be, and return why; nothing may be written."""
     before = bytes_of(folder)
-    done = calibrate(folder, *options)
-    assert isinstance(done.exception, InputError), done.output
+    said = typed_commands.refused("calibrate", folder, *options)
     assert bytes_of(folder) == before
-    return str(done.exception)
+    return said
 
 
 def test_the_target_of_imported_board_views_is_given_once(lab: Path) -> None:
@@ -150,13 +149,11 @@ def test_a_recording_is_told_the_two_commands(tmp_path: Path, name: str) -> None
     if path.parent != tmp_path:
         (path.parent / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
         path = path.parent
-    with pytest.raises(InputError) as said:
-        require_no_bag(path, "tag:7,size=80mm")
-    _, first, second = str(said.value).splitlines()
+    said = refusals.refused(".", require_no_bag, path, "tag:7,size=80mm")
+    _, first, second = said.splitlines()
     assert first == f"  realsim import {path} run/calibration/capture"
     assert second == "  realsim calibrate run --board tag:7,size=80mm"
-    done = calibrate(path)
-    assert isinstance(done.exception, InputError) and "is a recording" in str(done.exception)
+    assert "is a recording" in typed_commands.refused("calibrate", path)
 
 
 def test_what_is_damaged_missing_or_said_twice_is_refused(lab: Path, tmp_path: Path) -> None:

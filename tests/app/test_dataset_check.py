@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import Result
 
 from begun_sessions import begun
 from bop_scenes import edit, write_boxes
@@ -281,15 +280,10 @@ def session(tmp_path: Path) -> Path:
     return folder
 
 
-def run(*arguments: str | Path) -> Result:
-    return invoked("check", *arguments)
-
-
 def test_a_sound_session_ends_with_0(session: Path) -> None:
-    result = run(session)
-    assert result.exit_code == 0, result.output
+    result = finished("check", session)
     assert "4 of 5 planned" in result.output and "sound: every listed file" in result.output
-    told = json.loads(run(session, "--json").output)
+    told = json.loads(invoked("check", session, "--json").output)
     assert told["sound"] and told["views_not_captured"] == [4]
     assert [r["views"] for r in told["inner"]] == [2]
 
@@ -298,21 +292,20 @@ def test_damage_ends_with_1_and_a_repair_takes_it_out(session: Path) -> None:
     path = session / "calibration/capture/depth/000001.png"
     path.write_bytes(path.read_bytes()[:-20])
     (session / "rgb/000002.png").unlink()
-    result = run(session)
+    result = invoked("check", session)
     assert result.exit_code == 1
     assert "rgb/000002.png" in result.output and "depth/000001.png" in result.output
     assert "--repair" in result.output
-    told = json.loads(run(session, "--json").output)
+    told = json.loads(invoked("check", session, "--json").output)
     assert told["views_damaged"] == [2] and told["inner"][0]["views_damaged"] == [1]
-    repaired = run(session, "--repair")
-    assert repaired.exit_code == 0, repaired.output
+    repaired = finished("check", session, "--repair")
     assert "views 2 count as not captured" in repaired.output
     assert "damaged/depth/000002.png" in repaired.output
-    assert run(session).exit_code == 0
-    again = json.loads(run(session, "--repair", "--json").output)
+    finished("check", session)
+    again = json.loads(invoked("check", session, "--repair", "--json").output)
     assert again["moved"] == [] and again["dropped_views"] == []
     assert SessionStore.open(session).completed == {0, 1, 3}
-    assert run(session, "--decode").exit_code == 0
+    finished("check", session, "--decode")
 
 
 def test_what_is_no_session_ends_with_2(session: Path) -> None:
@@ -331,22 +324,21 @@ def test_files_without_a_checksum_are_named_and_those_of_others_explained(sessio
     path = session / "manifest.jsonl"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(line for line in lines if "rgb/000001" not in line))
-    result = run(session)
-    assert result.exit_code == 0
+    result = finished("check", session)
     assert "1: rgb/000001.png" in result.output and "models/ 1 (no checksum" in result.output
     assert "1 files of the session have no checksum" in result.output
-    told = json.loads(run(session, "--json").output)
+    told = json.loads(invoked("check", session, "--json").output)
     assert told["files_without_checksum"] == ["rgb/000001.png"]
     assert told["files_beside"] == {"models/": 1}
     assert {f["path"]: f["kind"] for f in told["findings"]} == {"rgb/000001.png": "unproven"}
-    repaired = run(session, "--repair")
-    assert repaired.exit_code == 0 and "rgb/000001.png" in repaired.output
+    repaired = finished("check", session, "--repair")
+    assert "rgb/000001.png" in repaired.output
     assert "nothing can tell" in repaired.output
-    assert json.loads(run(session, "--json").output)["files_without_checksum"] == []
+    assert json.loads(invoked("check", session, "--json").output)["files_without_checksum"] == []
 
 
 def test_a_running_capture_is_not_repaired(session: Path) -> None:
     with only_run_in(session):
         done = realsim("check", session, "--repair")
         assert done.returncode == 2 and "another run is working" in done.stderr
-        assert run(session).exit_code == 0
+        finished("check", session)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from bop_scenes import edit
-from labelled_scenes import SceneInMemory, labelled_scene, written_bop, written_graspnet
+from labelled_scenes import labelled_scene, written_bop, written_graspnet
 from realsim import images
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
@@ -60,8 +60,7 @@ def session(tmp_path_factory):
     store = captured_session(tmp_path_factory.mktemp("stats") / "scene_000004", count=3)
     scene = load_scene(store)
     C = np.diag([4e-3, 2e-3, 1e-3, 3e-4, 2e-4, 1e-4]) ** 2
-    verdicts = ("accepted", "doubtful")
-    judged = zip(scene.objects, verdicts, strict=True)
+    judged = zip(scene.objects, ("accepted", "doubtful"), strict=True)
     objects = tuple(replace(o, covariance=C, verdict=v) for o, v in judged)
     save_scene(store, replace(scene, objects=objects))
     annotate_session(store, QUIET)
@@ -151,16 +150,9 @@ def test_what_is_no_session_is_refused(session, tmp_path):
 MOVE = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(0.5)]), [0.002, 0.0, 0.0])
 
 
-class WithGrasps(SceneInMemory):
-    def grasps(self):
-        return self.tried
-
-
 def with_grasps(plain, tried):
     """Return a scene of whose grasps one set is known."""
-    of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
-    of.tried = SceneGrasps(sets=(tried,))
-    return of
+    return replace(plain, tried=SceneGrasps(sets=(tried,)))
 
 
 def moved(frame):
@@ -214,17 +206,15 @@ def test_a_release_is_the_same_as_itself(releases):
 def test_grasps_are_added_lost_and_changed(tmp_path):
     plain = labelled_scene(tmp_path / "s", [0])
     whole = tried_set(np.random.default_rng(3), 12, obj_id=7, instance=1, measures=())
-    whole = replace(whole, scores=np.full(12, 0.5))
-    scores = np.full(12, 0.5)
-    scores[3] = 0.8
+    before, after = np.full(12, 0.5), np.where(np.arange(12) == 3, 0.8, 0.5)
 
-    def scene(rows, values):
-        s = replace(whole, scores=values)
+    def scene(rows, scores):
+        s = replace(whole, scores=scores)
         arrays = "Ts_obj_grasp widths_m scores base_scores slip_m slip_rad reachable"
         picked = {name: getattr(s, name)[rows] for name in arrays.split()}
         return with_grasps(plain, replace(s, **picked, failures=tuple(s.failures[k] for k in rows)))
 
-    found = diff_scenes("s", scene(np.arange(10), whole.scores), scene(np.arange(2, 12), scores))
+    found = diff_scenes("s", scene(np.arange(10), before), scene(np.arange(2, 12), after))
     assert (found.grasps_lost, found.grasps_added) == (2, 2)
     assert (found.grasps_changed, found.grasps_kept) == (1, 7)
     assert not found.is_same
@@ -308,10 +298,8 @@ def test_renumbered_models_are_the_same_objects(releases, tmp_path):
         info = json.loads((models / "models_info.json").read_text())
         info = {str(new[int(k)]): row for k, row in info.items()}
         (models / "models_info.json").write_text(json.dumps(info))
-        for file in [models / f"obj_{k:06d}.ply" for k in new]:
-            file.rename(file.with_suffix(".was"))
         for k, n in new.items():
-            (models / f"obj_{k:06d}.was").rename(models / f"obj_{n:06d}.ply")
+            (models / f"obj_{k:06d}.ply").rename(models / f"obj_{n:06d}.ply")
 
     row = changed_copy(releases, tmp_path, renumber)
     assert not (row["objects_added"] or row["objects_lost"] or row["moved"])
@@ -325,8 +313,7 @@ def test_another_instance_of_the_same_model_is_the_same_object(tmp_path):
             pairs = zip(frame.objects, numbers, strict=True)
             return tuple(replace(o, instance=n) for o, n in pairs)
 
-        scene = SceneInMemory(folder=plain.folder, frames=dict(plain.frames), masks=plain.masks)
-        return scene.change_frames(objects=renamed)
+        return replace(plain, frames=dict(plain.frames)).change_frames(objects=renamed)
 
     found = diff_scenes("s", with_instances(0, 1, 2), with_instances(5, 1, 9))
     assert found.is_same
