@@ -21,9 +21,8 @@ def frame(tmp_path_factory):
     written_graspnet(home / "tree", labelled_scene(home / "images", [0]))
     camera, image = home / "tree/scenes/scene_0003/realsense", home / "frame"
     image.mkdir()
-    names = (("rgb", "png", "color"), ("depth", "png", "depth"), ("meta", "mat", "meta"))
-    for kind, ending, name in names:
-        shutil.copy(camera / f"{kind}/0000.{ending}", image / f"{name}.{ending}")
+    for source, name in (("rgb", "color.png"), ("depth", "depth.png"), ("meta", "meta.mat")):
+        shutil.copy(next((camera / source).glob("0000.*")), image / name)
     shutil.copytree(home / "tree/models", home / "as_graspnet")
     save_models(home / "as_bop", MODELS)
     return image

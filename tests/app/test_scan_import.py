@@ -181,7 +181,6 @@ def test_a_bop_folder_is_completed(tmp_path: Path):
     assert "1/1 wedge: symmetries" in out and "1 of 1 completed" in out
     code, out, _ = run("scan", "show", tmp_path / "bop/models", "wedge")
     assert code == 0 and "100 (weighed)" in out
-    shutil.rmtree(tmp_path / "bop")
 
 
 @pytest.mark.slow

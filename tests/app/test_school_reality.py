@@ -18,7 +18,7 @@ from realsim.app.school.run import config_of
 from realsim.geometry.parts import part
 from realsim.untrusted.own_json import read_own
 from realsim_sim_bridge.hold.calibration import Calibration
-from school_sessions import refused, run, scene
+from school_sessions import finished, refused, scene
 from tried_grasps import tried_set
 
 KINDS = ("chips_can", "gelatin_box", "wooden_box")
@@ -37,8 +37,7 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     out, fit = trials.parent / "out", trials.parent / "fit.json"
     masses = ("--weighed", "wooden_box=0.1", "--weighed", "chips_can=0.1")
     words = ("--draws", 2, *masses, "--cache", trials.parent / "cache")
-    found = run("reality", trials, *words, "--out", out, "--fit", fit, "--json")
-    assert found.exit_code == 0, found.output
+    finished("reality", trials, *words, "--out", out, "--fit", fit, "--json")
     report = json.loads((out / "reality.json").read_text())
     assert report["in_sample"] is True and len(report["p_hold"]) == 24
     assert report["predictors"]["p_hold"]["auc"] > 0.7
@@ -49,8 +48,8 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     # Bad grasps held in 1 of 4 and good ones in 3 of 4: what the curve must say of 0 and 1.
     np.testing.assert_allclose(told.p_hold(np.array([0.0, 1.0])), [0.25, 0.75], atol=0.02)
     # It serves the next run and the school, which refuse what is no calibration.
-    again = run("reality", trials, *words, "--p-hold-calibration", fit, "--json")
-    assert again.exit_code == 0 and '"in_sample": true' in again.output
+    again = finished("reality", trials, *words, "--p-hold-calibration", fit, "--json")
+    assert '"in_sample": true' in again.output
     config = config_of(SchoolRequest(calibration=fit), scene())
     assert config.calibration == told
     none = SchoolRequest(calibration=out / "reality.json")
@@ -61,8 +60,7 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
 def test_trials_of_a_known_object_that_all_ended_alike_are_told(tmp_path: Path) -> None:
     Ts, _ = box_grasps()
     write_graspa(tmp_path, "chips_can", Ts[3:5], [True, True])
-    found = run("reality", tmp_path, "--draws", 2)
-    assert found.exit_code == 0, found.output
+    found = finished("reality", tmp_path, "--draws", 2)
     assert "fitted on trials of chips_can too" in " ".join(found.output.split())
     assert "all trials ended alike" in found.output and "nan" not in found.output
 
@@ -93,9 +91,8 @@ def test_rows_add_up_and_levels_only_rise() -> None:
     header, rows = tables.school_table(sets, models)
     assert header == tables.SCHOOL_HEADER
     plain = [replace(s, measures={}) for s in sets]
-    assert tables.school_table(plain, models)[0] == tables.SCHOOL_HEADER[
-        :9
-    ] and not tables.p_hold_line(plain)
+    assert tables.school_table(plain, models)[0] == tables.SCHOOL_HEADER[:9]
+    assert not tables.p_hold_line(plain)
     assert tables.p_hold_line(sets).startswith("p_hold of ")
     assert "estimate" not in tables.p_hold_line(sets)  # they are of Franka's hand
     own = [replace(s, parameters={"config": {"hand": {"name": "wide"}}}) for s in sets]
