@@ -79,5 +79,4 @@ def test_scenes_upgraded_on_a_cluster_are_those_upgraded_here(tmp_path: Path) ->
     mine, theirs = content(tmp_path / "here"), content(tmp_path / "there")
     assert len(mine) > 100
     assert [k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k)] == []
-    again = upgraded(dataset, tmp_path / "there")
-    assert json.loads(again.stdout)["skipped"] == 2
+    assert json.loads(upgraded(dataset, tmp_path / "there").stdout)["skipped"] == 2
