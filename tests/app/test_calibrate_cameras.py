@@ -267,19 +267,17 @@ def plane_depth(T_cam_board: Array) -> Array:
 
 def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     """Fixed cameras are sessions in cameras/NAME, or just images in rgb_NAME/."""
-    rng = np.random.default_rng(3)
-    views = tuple(View(index=k, T_base_ee=T) for k, T in enumerate(hands(rng)))
+    Ts = hands(np.random.default_rng(3))
     capture = tmp_path / "session/calibration/capture"
     store = begun(capture, CAMERA, unit_m=0.001)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
-    for view in views:
-        store.add_view(view, load_image(photos / f"wrist/{view.index:03d}.png"), depth)
+    for k, hand in enumerate(Ts):
+        view = View(index=k, T_base_ee=hand)
+        store.add_view(view, load_image(photos / f"wrist/{k:03d}.png"), depth)
     store.close()
     (capture / "rgb_right").mkdir()
     left = begun(camera_folder(capture, "left"), CAMERA, unit_m=0.001)
-    for k in range(VIEWS):
-        hand = views[k].T_base_ee
-        assert hand is not None
+    for k, hand in enumerate(Ts):
         held = se3.invert(FIXED["left"]) @ hand @ Z_HELD
         seen = BIAS.measured(plane_depth(held)).astype(np.float32)
         left.add_view(View(index=k), load_image(photos / f"left/{k:03d}.png"), seen)

@@ -40,6 +40,7 @@ from typed_commands import finished, invoked, refused
 
 QUIET = Console(quiet=True)
 MUG = RegisterRequest(objects=("mug",))
+MODELS = models_of()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Res
     store = SessionStore.open(folder)
     found = load_registered(store)
     for o, true in zip(found.scene.objects, true_poses(), strict=True):
-        corners = models_of()[o.obj_id].mesh.vertices
+        corners = MODELS[o.obj_id].mesh.vertices
         gap = se3.transform(o.T_world_obj, corners) - se3.transform(true.T_world_obj, corners)
         assert np.linalg.norm(gap, axis=1).max() < 2e-3
         assert o.covariance is not None and o.verdict != "rejected"
@@ -117,8 +118,7 @@ def test_what_cannot_be_used_is_named(
 def test_a_flat_model_is_named_and_stays_out_of_the_session(
     session: SessionStore, tmp_path: Path
 ) -> None:
-    sheet = ObjectModel(obj_id=50, name="sheet", mesh=square(0.05))
-    save_models(tmp_path / "lib", {50: sheet})
+    save_models(tmp_path / "lib", {50: ObjectModel(obj_id=50, name="sheet", mesh=square(0.05))})
     said = refused("register", session.folder, "--library", tmp_path / "lib", "--object", 50)
     assert "object 50" in said and "flat" in said
     assert not list(session.folder.glob("models/*000050*"))
@@ -141,7 +141,7 @@ def test_views_and_models_that_take_part_are_chosen(session: SessionStore) -> No
 
 def test_models_that_are_not_sought_are_named(session: SessionStore, tmp_path: Path) -> None:
     mug, wedge = (part(n).obj_id for n in ("mug", "wedge"))
-    others = {mug: replace(models_of()[mug], name="jug"), 77: replace(models_of()[mug], obj_id=77)}
+    others = {mug: replace(MODELS[mug], name="jug"), 77: replace(MODELS[mug], obj_id=77)}
     save_models(tmp_path / "lib", others)
     session.path(f"models/obj_{wedge:06d}.ply").unlink()
     request = RegisterRequest(find_all=True, library=tmp_path / "lib")
@@ -150,7 +150,7 @@ def test_models_that_are_not_sought_are_named(session: SessionStore, tmp_path: P
     clash, lost = inputs.models_out
     assert f"model {mug} of the library, 'jug', is not used" in clash
     assert lost.endswith(f"without a mesh, which are not sought: {wedge}.")
-    save_models(tmp_path / "own", {mug: models_of()[mug]})
+    save_models(tmp_path / "own", {mug: MODELS[mug]})
     again = read_inputs(session, replace(request, library=tmp_path / "own"))
     assert len(again.models_out) == 1 and again.key != inputs.key
     (tmp_path / f"lib/obj_{77:06d}.ply").unlink()
@@ -184,12 +184,11 @@ def test_the_key_changes_with_everything_that_matters(session: SessionStore) -> 
     ]  # fmt: skip
     keys = {read_inputs(session, replace(MUG, **other)).key for other in others}
     assert len(keys) == len(others) and key not in keys
-    models = models_of()
-    mug = models[part("mug").obj_id]
+    mug = MODELS[part("mug").obj_id]
     larger = replace(mug, mesh=replace(mug.mesh, vertices=1.0001 * mug.mesh.vertices))
     for file in session.path("models").iterdir():
         file.unlink()  # linked to those of the other tests
-    save_models(session.path("models"), models | {larger.obj_id: larger})
+    save_models(session.path("models"), MODELS | {larger.obj_id: larger})
     keys.add(read_inputs(session, MUG).key)
     moved = session.session.Ts_world_cam[0] @ se3.from_translation([1e-4, 0, 0])
     session.set_cameras(session.session.intrinsics, {0: moved})
@@ -257,9 +256,6 @@ def test_hand_held_cameras_are_found_once_and_kept(tmp_path: Path) -> None:
     assert set(again.session.Ts_world_cam) == set(range(5))
 
 
-MODELS = models_of()
-
-
 @pytest.fixture(scope="module")
 def store(few_views: Path) -> SessionStore:
     return SessionStore.open(few_views)
@@ -271,25 +267,20 @@ def result(store: SessionStore) -> Registered:
     return registered_by_hand(store)
 
 
-def size_of(data: bytes) -> tuple[int, int]:
-    """Return width and height of a picture that can be read."""
-    with Image.open(io.BytesIO(data)) as picture:
-        picture.load()
-        return picture.size
-
-
 def test_every_picture_is_drawn_and_stands_on_the_page(
     store: SessionStore, result: Registered
 ) -> None:
     pictures = draw_pictures(store, result, MODELS)
     assert set(pictures) == {"overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"}
-    assert all(min(size_of(data)) > 400 for data in pictures.values())
+    for data in pictures.values():
+        with Image.open(io.BytesIO(data)) as picture:
+            picture.load()  # it can be read
+            assert min(picture.size) > 400
     page = page_bytes(store, result, MODELS, pictures).decode()
     assert page.count("data:image/jpeg;base64,") == 3 and page.count("data:image/png") == 1
     assert "half of it is hidden." in page and "nothing there looks like it." in page
-    assert (
-        "cameras moved by 0.47 mm / 0.11 deg together (hand-eye), 0.19 mm / 0.03 deg each" in page
-    )
+    moved = "cameras moved by 0.47 mm / 0.11 deg together (hand-eye), 0.19 mm / 0.03 deg each"
+    assert moved in page
     assert "http" not in page.replace("http-equiv", "")  # nothing is loaded from elsewhere
 
 

@@ -246,8 +246,8 @@ def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: Se
     files = documents(result, store, MODELS)
     store.write_bytes(results.NEXT_FILE, atomic.json_bytes({"before": before, "files": files}))
     assert not store.has(results.SCENE_FILE)
-    scene = judged_scene(store)
-    assert [o.instance for o in scene.objects] == [0, 1] and not store.has(results.NEXT_FILE)
+    assert [o.instance for o in judged_scene(store).objects] == [0, 1]
+    assert not store.has(results.NEXT_FILE)
     np.testing.assert_allclose(store.session.Ts_world_cam[0], result.cameras.refined[0], atol=1e-15)
 
 

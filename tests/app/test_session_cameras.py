@@ -118,11 +118,10 @@ def test_bop_has_a_suffix_for_every_camera_and_is_read_back(exported: Path) -> N
     assert (left.session.intrinsics.fx, wrist.session.intrinsics.fx) == (330.0, 300.0)
     # BOP's readers know no lens: the fixed camera's is taken out.
     assert not left.session.intrinsics.is_distorted
-    world = []
-    for found, k in ((left, 1), (wrist, 4)):
-        T = found.session.view(k).T_world_cam
-        assert T is not None
-        world.append({a.obj_id: T @ a.T_cam_obj for a in found.ground_truth[k]})
+    world = [
+        {a.obj_id: f.session.Ts_world_cam[k] @ a.T_cam_obj for a in f.ground_truth[k]}
+        for f, k in ((left, 1), (wrist, 4))
+    ]
     assert set(world[0]) == set(world[1]) == {o.obj_id for o in true_poses()}
     for o in true_poses():
         np.testing.assert_allclose(world[0][o.obj_id], world[1][o.obj_id], atol=1e-6)
