@@ -201,10 +201,9 @@ def test_every_command_is_listed_with_a_whole_sentence() -> None:
     ctx = click.Context(commands, info_name="realsim")
     lines = commands.get_help(ctx).splitlines()
     for title, group in GROUPS.items():
-        at = lines.index(f"{title}:")
-        assert [f"  {name:15} {does}." for name, does in group.items()] == lines[
-            at + 1 : at + 1 + len(group)
-        ]
+        at = lines.index(f"{title}:") + 1
+        listed = [f"  {name:15} {does}." for name, does in group.items()]
+        assert listed == lines[at : at + len(group)]
     for name in COMMANDS:
         command = commands.get_command(ctx, name)
         assert command is not None and command.name == name
@@ -237,19 +236,16 @@ def test_old_names_work_with_a_note(
         known = {spelling(o) for o in settable(command)}
         assert set(names.values()) <= known and not known & names.keys(), path
     command = EVERY["capture",]
-    ctx = command.make_context(
-        "capture", [str(tmp_path / "out"), "--plan=p", "--views=1-3", "--camera", "7"],
-        parent=context_of(commands, ()),
-    )  # fmt: skip
+    typed, parent = [str(tmp_path / "out"), "--plan=p"], context_of(commands, ())
+    more = ["--views=1-3", "--camera", "7"]
+    ctx = command.make_context("capture", [*typed, *more], parent=parent)
     assert ctx.params["views"] == (1, 2, 3) and ctx.params["camera"] == "7"
     said = capsys.readouterr().err
     assert "--views is now called --only-views" in said and "--camera-serial" in said
     monkeypatch.setenv("REALSIM_CAPTURE_CAMERA", "8")
     monkeypatch.setenv("REALSIM_CAPTURE_CAMERA_SERIAL", "")
     monkeypatch.delenv("REALSIM_CAPTURE_CAMERA_SERIAL")  # unset again at the end
-    ctx = command.make_context(
-        "capture", [str(tmp_path / "out"), "--plan=p"], parent=context_of(commands, ())
-    )
+    ctx = command.make_context("capture", typed, parent=parent)
     assert ctx.params["camera"] == "8"
     (tmp_path / "s.toml").write_text('[render]\ncamera = "d435"\n')
     done = realsim("--config", tmp_path / "s.toml", "config", "show", "render")
