@@ -6,11 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+import trimesh_solids
 from realsim.geometry import metrics, se3
 from realsim.geometry.mesh import hull_vertices, sample_surface, symmetry_transforms
 from realsim.geometry.parts import part
 from realsim.geometry.symmetric_poses import nearest_symmetry
-from realsim.records import CameraIntrinsics, Mesh, ObjectModel
+from realsim.records import CameraIntrinsics, ObjectModel
 from refusals import refused
 
 FINE_RAD = np.radians(0.01)
@@ -26,14 +27,9 @@ def ring(radius: float, height: float, sides: int = 720) -> np.ndarray:
 
 def ball(radius: float, center: np.ndarray) -> ObjectModel:
     """Return a sphere as the symmetry finder describes it: three axes through its centre."""
-    k = np.arange(2000) + 0.5
-    polar, around = np.arccos(1 - 2 * k / 2000), np.pi * (1 + 5**0.5) * k
-    v = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1)
-    from scipy.spatial import ConvexHull
-
-    mesh = Mesh(vertices=center + radius * v, faces=ConvexHull(v).simplices.astype(np.int32))
     at = (float(center[0]), float(center[1]), float(center[2]))
     axes = tuple((axis, at) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    mesh = trimesh_solids.ball(radius, at=at)
     return ObjectModel(obj_id=1, name="ball", mesh=mesh, symmetry_axes=axes)
 
 
@@ -89,8 +85,7 @@ def test_known_answers_of_a_cylinder():
     flip = se3.from_rt(se3.exp_so3([np.pi, 0, 0]), np.zeros(3))
     upright = v + np.array([0, 0, 0.02])
     assert nearest_symmetry(np.eye(4), flip, upright, None, axis).distance_m > 0.039
-    both = np.stack([np.eye(4), flip])
-    near = nearest_symmetry(np.eye(4), turned @ flip, v, both, axis)
+    near = nearest_symmetry(np.eye(4), turned @ flip, v, np.stack([np.eye(4), flip]), axis)
     assert near.distance_m == pytest.approx(0.005, rel=1e-6)
 
 
