@@ -78,8 +78,7 @@ def test_jacobians_are_finite_differences(name):
     def moved(k, step):
         x = start.copy()
         x[k] += step
-        c = replace(i, fx=x[0], fy=x[1], cx=x[2], cy=x[3], distortion=x[4:])
-        return camera.project(c, p)
+        return camera.project(replace(i, fx=x[0], fy=x[1], cx=x[2], cy=x[3], distortion=x[4:]), p)
 
     for k in range(12):
         numeric = (moved(k, h) - moved(k, -h)) / (2 * h)

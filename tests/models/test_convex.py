@@ -97,8 +97,7 @@ def test_a_decomposition_out_of_time_gives_the_hull_and_says_so(tmp_path, monkey
 @pytest.mark.slow
 def test_what_was_found_in_time_is_taken():
     # At threshold 1 nothing is cut, which takes no time; 0.02 takes a flange 20 CPU-s and more.
-    config = ConvexConfig(thresholds=(1.0, 0.02), time_limit_s=4.0)
-    cut = convex_parts(part("flange").mesh, config)
+    cut = convex_parts(part("flange").mesh, ConvexConfig(thresholds=(1.0, 0.02), time_limit_s=4.0))
     assert cut.method == "coacd" and "stopped" in cut.notes[0] and "at best" in cut.notes[1]
     assert "(threshold 1)" in cut.notes[1] and cut.volume_ratio > 1.5
 

@@ -36,8 +36,7 @@ def without(mesh, rows):
     keep[rows] = False
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
     known = [k for k in ("vertices", "colors", "uv") if getattr(mesh, k) is not None]
-    rest = {k: getattr(mesh, k)[used] for k in known}
-    return replace(mesh, faces=faces.reshape(-1, 3), **rest)
+    return replace(mesh, faces=faces.reshape(-1, 3), **{k: getattr(mesh, k)[used] for k in known})
 
 
 def near(mesh, point, radius):
@@ -221,8 +220,7 @@ def test_texture_seams_stay_and_the_surface_is_closed_all_the_same():
     np.testing.assert_array_equal(colors_at(repair.mesh, points), colors_at(mesh, points))
     np.testing.assert_array_equal(repair.mesh.texture, texture)
     assert len(repair.mesh.vertices) == len(mesh.vertices)
-    same = replace(mesh, uv=np.zeros_like(uv))
-    assert len(repaired(same).mesh.vertices) == 8
+    assert len(repaired(replace(mesh, uv=np.zeros_like(uv))).mesh.vertices) == 8
 
 
 def test_rims_that_meet_within_rounding_are_one():
@@ -295,6 +293,5 @@ def test_a_moebius_band_is_named_and_left():
 
 def test_a_folded_sheet_has_no_volume():
     assert "thin sheet" in kinds(inspect_mesh(two_sided(open_bowl())))
-    paper = box((0.1, 0.08, 5e-5))
-    assert "thin sheet" in kinds(inspect_mesh(paper))
+    assert "thin sheet" in kinds(inspect_mesh(box((0.1, 0.08, 5e-5))))
     assert "thin sheet" not in kinds(inspect_mesh(box((0.1, 0.08, 1e-3))))

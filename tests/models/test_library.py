@@ -97,8 +97,7 @@ def test_a_texture_comes_back_bit_for_bit(library: ModelLibrary):
 def test_any_bop_reader_reads_the_library(library: ModelLibrary):
     library.add(made("cone"), "cone", obj_id=7)
     library.add(made("box"), "box")
-    models = load_models(library.folder)
-    assert {i: m.name for i, m in models.items()} == {7: "cone", 8: "box"}
+    assert {i: m.name for i, m in load_models(library.folder).items()} == {7: "cone", 8: "box"}
     info = json.loads((library.folder / "models_info.json").read_text())
     assert list(info) == ["7", "8"]
     assert info["7"]["diameter"] == pytest.approx(1e3 * diameter(part("cone").mesh), rel=1e-3)
@@ -121,10 +120,8 @@ def open_box() -> Mesh:
 def test_every_stage_gets_the_weighed_mass(library: ModelLibrary, mesh: Mesh):
     # The search for the parts of an open box takes long, and any parts will do.
     quick = replace(CONFIG, convex=replace(CONFIG.convex, time_limit_s=1.0))
-    given = prepare_mesh(mesh, quick, Matter(mass_kg=0.321))
-    model = library.add(given, "weighed").model
-    stage = mass_properties(model.mesh, model.density)
-    assert stage.mass_kg == pytest.approx(0.321, rel=1e-5)
+    model = library.add(prepare_mesh(mesh, quick, Matter(mass_kg=0.321)), "weighed").model
+    assert mass_properties(model.mesh, model.density).mass_kg == pytest.approx(0.321, rel=1e-5)
     solid, why = library.solid(1)
     assert solid is not None and why == "" and solid.matter.mass_kg == pytest.approx(0.321)
 
@@ -345,9 +342,8 @@ def test_nonsense_scales_are_refused():
 
 
 def test_a_session_gets_what_it_needs_and_no_more(library: ModelLibrary, tmp_path: Path):
-    made = prepare_mesh(part("wedge").mesh, PrepareConfig())
     for name in ("box", "wedge", "tube"):
-        library.add(made, name)
+        library.add(made("wedge"), name)
     session = tmp_path / "session/models"
     there = r"object 8, 9 is not in .*box \(1\), wedge \(2\)"
     refused(there, copy_models, library, [1, 8, 9], session)
@@ -396,8 +392,7 @@ def test_every_part_has_its_colour():
     cube = part("cube").mesh
     beside = replace(cube, vertices=cube.vertices + np.array([0.05, 0, 0]))
     mesh = replace(merged([cube, beside]), colors=None)
-    both = (cube.vertices, beside.vertices)
-    parts = ConvexParts(parts=both, volume_ratio=1.0, method="hull")
+    parts = ConvexParts(parts=(cube.vertices, beside.vertices), volume_ratio=1.0, method="hull")
     sheet = model_sheet(mesh, UNKNOWN, parts)
     r, g, b = np.moveaxis(sheet[: sheet.shape[0] // 2, 2 * PANEL[0] :].astype(int), -1, 0)
     for stronger in (b - r, r - b):  # blue, orange
@@ -431,7 +426,7 @@ def test_the_axes_of_known_shapes(name: str, orders: dict[int, int]):
 
 def test_problems_are_written_on_the_sheet():
     reason = "open: 24 boundary edges in 2 holes"
-    p = prepare_unscaled(part("wedge").mesh, PrepareConfig()).properties
+    p = prepare_unscaled(part("wedge").mesh, CONFIG).properties
     p = replace(p, verdict="doubtful", reasons=(reason,))
     lines = figure_lines(part("wedge").mesh, p)
     assert ("look", reason) in lines

@@ -101,8 +101,7 @@ def test_several_textures_become_one_with_all_colours(tmp_path):
     second = replace(second, vertices=second.vertices + np.array([0.12, 0.02, 0.0]))
     plain = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
     plain.apply_translation([0, 0.1, 0])
-    scene = trimesh.Scene([as_trimesh(first), as_trimesh(second), plain])
-    scene.export(tmp_path / "scene.glb")
+    trimesh.Scene([as_trimesh(first), as_trimesh(second), plain]).export(tmp_path / "scene.glb")
     scan = read_scan(tmp_path / "scene.glb", "m", up="z")
     assert len(scan.mesh.faces) == len(first.faces) + len(second.faces) + len(plain.faces)
     assert colour_agreement(first, scan.mesh) > 0.99
@@ -185,8 +184,7 @@ def test_usd_transforms_instances_and_mirrors(tmp_path):
 
 
 def test_usd_left_handed_winding_is_turned(tmp_path):
-    inside_out = replace(BRACKET, faces=BRACKET.faces[:, ::-1])
-    stage = write_usd(tmp_path / "a.usda", inside_out)
+    stage = write_usd(tmp_path / "a.usda", replace(BRACKET, faces=BRACKET.faces[:, ::-1]))
     UsdGeom.Mesh(stage.GetPrimAtPath("/thing/shape")).CreateOrientationAttr("leftHanded")
     stage.GetRootLayer().Save()
     scan = read_scan(tmp_path / "a.usda", None)
@@ -273,8 +271,7 @@ def test_gltf_and_usd_say_which_axis_is_up(tmp_path):
 
 def test_texture_transforms_of_gltf_and_usd():
     uv = np.array([[0.2, 0.7], [0.4, 0.1]])
-    same = transformed_uv(uv, (0, 0), 0.0, (1, 1), v_down=True)
-    np.testing.assert_allclose(same, uv)
+    np.testing.assert_allclose(transformed_uv(uv, (0, 0), 0.0, (1, 1), v_down=True), uv)
     # glTF's own example: offset (0, 1) and rotation pi/2 turn the picture by 90 degrees.
     turned_uv = transformed_uv(uv, (0.0, 1.0), np.pi / 2, (0.5, 0.5), v_down=True)
     down = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)

@@ -186,8 +186,7 @@ def test_one_percent_of_shape_error_hides_no_symmetry(name):
 
 def test_uneven_triangles_and_noise_change_nothing():
     model = part("wedge")
-    noisy = subdivided(model.mesh, np.random.default_rng(4), 3, 0.0003)
-    found = find_symmetries(noisy)
+    found = find_symmetries(subdivided(model.mesh, np.random.default_rng(4), 3, 0.0003))
     assert len(found.discrete) == len(model.symmetries) and found.axes == ()
     # Half a degree and half a millimetre, although nothing but the surface tells the axes.
     assert same_motions(model.symmetries, found.discrete, model.mesh, 0.01)
@@ -234,8 +233,7 @@ def test_a_feature_that_breaks_a_symmetry_is_seen_and_the_near_symmetry_named():
 def test_tolerances_decide_and_grams_of_millimetres_are_refused():
     square = hull(np.array(list(np.ndindex(2, 2, 2))) * [1.0, 1.02, 2.0] - 0.5)
     assert len(find_symmetries(square).discrete) == 8
-    strict = SymmetryConfig(tolerance=0.002, greatest_tolerance=0.002)
-    found = find_symmetries(square, strict)
+    found = find_symmetries(square, SymmetryConfig(tolerance=0.002, greatest_tolerance=0.002))
     assert len(found.discrete) == 4 and "turn by 1/4" in " ".join(found.near)
     refused("shares of the diameter", SymmetryConfig, tolerance=1.3)
 
@@ -280,8 +278,7 @@ def test_an_undeclared_symmetry_is_taken_where_nothing_tells_it(tmp_path, monkey
 
     # One end red: no flip, no symmetry for a photograph.
     colors = np.where(bar.vertices[:, 2:] > 0, [255, 0, 0], [0, 0, 0]).astype(np.uint8)
-    red_end = replace(model, mesh=replace(bar, colors=colors))
-    painted, words = with_found_symmetries(red_end, None)
+    painted, words = with_found_symmetries(replace(model, mesh=replace(bar, colors=colors)), None)
     assert len(painted.symmetries) == 1 and "photograph" in words
 
 

@@ -137,8 +137,7 @@ def test_what_calibrations_say_becomes_the_prior():
 def test_without_a_table_and_with_a_lost_object():
     c = case()
     lost = moved_body(c.bodies[2], se3.from_translation([0, 0, 0.4]) @ c.bodies[2].T_start)
-    bodies = [*c.bodies[:2], lost]
-    many = register_many(c.intake, bodies, [None] * 3, None, CONFIG)
+    many = register_many(c.intake, [*c.bodies[:2], lost], [None] * 3, None, CONFIG)
     np.testing.assert_allclose(many.poses[2], lost.T_start, atol=1e-9)
     assert len(many.clouds[2].points) == 0
     assert np.sqrt(many.covariances[2][3, 3]) > 0.3

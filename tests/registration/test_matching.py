@@ -153,8 +153,7 @@ def test_the_table_is_zero_and_the_block_has_its_height(rng):
     on = np.all(np.abs(xy - [0.05, 0.02]) < [0.03, 0.02], axis=1)
     points = np.c_[xy, np.where(on, 0.05, 0.0) + rng.normal(0, 3e-4, n)]
     towards = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    cloud = Cloud(points=points, towards=towards, sigmas=np.full(n, 1e-3))
-    grid = height_grid(cloud, TABLE)
+    grid = height_grid(Cloud(points=points, towards=towards, sigmas=np.full(n, 1e-3)), TABLE)
     xy = grid.centers()
     inside = np.all(np.abs(xy - [0.05, 0.02]) < [0.027, 0.017], axis=-1)
     outside = np.any(np.abs(xy - [0.05, 0.02]) > [0.033, 0.023], axis=-1)

@@ -225,8 +225,7 @@ def registered(scene, *starts, **other):
 
 
 def worst_mm(scene, found):
-    errors = errors_mm(scene, found.scene.objects)
-    return max(errors[t.instance] for t in scene.truth)
+    return max(errors_mm(scene, found.scene.objects)[t.instance] for t in scene.truth)
 
 
 def with_a_larger(scene, obj_id, factor, about):
