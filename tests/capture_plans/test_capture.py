@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through, stopped
+from given_plans import QUICK, TURNED_HOME, driven_clear, ring_plan, stopped
 from killed_children import killed_growing
 from realsim.app.capture.fixed import fixed_stores, open_fixed, serials_of
 from realsim.arrays import Array
@@ -103,12 +103,9 @@ class TableCamera:
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
     """A ring of views that look down at the middle of the table, every third over a via point."""
-    center = np.array([0.40, 0.0, 0.0])
-    turns = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
-    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
-    joints = joints_looking_at(center, eyes, TURNED_HOME)
-    vias = tuple((k, (joints[k - 1] + joints[k])[None] / 2) for k in range(3, VIEWS, 3))
-    made = plan_through(np.stack(joints), TURNED_HOME, center, "calibration", vias=vias)
+    ring = ring_plan(np.array([0.40, 0.0, 0.0]), TURNED_HOME, VIEWS)
+    q = ring.joints
+    made = replace(ring, vias=tuple((k, (q[[k - 1]] + q[[k]]) / 2) for k in range(3, VIEWS, 3)))
     assert colliding_legs(made) == ()
     return made
 

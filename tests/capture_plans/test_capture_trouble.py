@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through
+from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through, ring_plan
 from plain_meshes import square
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -316,14 +316,6 @@ STOPS = 4
 HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 
-def small_plan(center: np.ndarray) -> CapturePlan:
-    """Views on a narrow ring that look down at a point of the table."""
-    turns = np.linspace(0.0, 2 * np.pi, STOPS, endpoint=False)
-    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
-    joints = joints_looking_at(center, eyes, HOME)
-    return plan_through(np.stack(joints), HOME, center, "calibration")
-
-
 class PersonAtThePendant(Operator):
     """Clears whatever stopped the arm, then says go."""
 
@@ -345,7 +337,7 @@ class PersonAtThePendant(Operator):
 def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path: Path) -> None:
     lab = SimulatedLab(LabConfig(width=128, height=72, n_objects=1))
     lab.place_board()
-    plan = small_plan(lab.scene_center)
+    plan = ring_plan(lab.scene_center, HOME, STOPS)
     words = {"tcp": "0,0,0.12,0,0,0.5", "joints": ",".join(map(str, HOME))}
     with LoopbackController.start(robot="UR5", speedup=10, **words) as controller:
         with UrArm(controller.host, model="UR5") as arm:

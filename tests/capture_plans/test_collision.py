@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from given_plans import calibrated
-from realsim.errors import InputError
+from given_plans import BENCH, calibrated
 from realsim.geometry import se3
 from realsim.interop import import_pinocchio
 from realsim.robots.arm import UR5, UR5E, arm_of, find_arm
@@ -19,10 +18,8 @@ from refusals import refused
 
 INF = np.inf
 EVERYWHERE = Box(lower=(-INF, -INF, -INF), upper=(INF, INF, 0.0))
-TABLE = Box(lower=(-0.6, -0.8, -INF), upper=(1.0, 0.8, 0.0))
-KEEP_OUT = Box(lower=(0.225, -0.15, -INF), upper=(0.525, 0.15, 0.12))
 LAMP = Box(lower=(0.1, 0.5, 0.6), upper=(0.3, 0.9, 1.4))
-CELL = WorkCell(table=TABLE, keep_out=KEEP_OUT, obstacles=(("lamp", LAMP),))
+CELL = replace(BENCH, obstacles=(("lamp", LAMP),))
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 
@@ -70,8 +67,8 @@ def test_turning_arm_and_cell_together_changes_nothing() -> None:
         ends = np.nan_to_num(np.array([box.lower, box.upper]), posinf=4, neginf=-4) @ quarter.T
         return Box(lower=tuple(ends.min(0).tolist()), upper=tuple(ends.max(0).tolist()))
 
-    lamp = ("lamp", turned(LAMP))
-    there = WorkCell(table=turned(TABLE), keep_out=turned(KEEP_OUT), obstacles=(lamp,))
+    table, keep_out, lamp = (turned(box) for box in (CELL.table, CELL.keep_out, LAMP))
+    there = WorkCell(table=table, keep_out=keep_out, obstacles=(("lamp", lamp),))
     q = joints(200, 3)
     before = model().clearance(q)
     after = model(cell=there).clearance(q + np.eye(6)[0] * np.pi / 2)
@@ -186,8 +183,6 @@ def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
 
 # --- Links on a calibrated chain whose DH frames lie tens of metres away are where they are.
 
-BENCH = replace(CELL, obstacles=())
-
 
 def chain_through(axes: list[tuple[np.ndarray, np.ndarray]]) -> DhChain:
     """The UR5 whose joint axes 1-6 at zero are these lines (point, direction), in DH numbers.
@@ -252,7 +247,6 @@ def test_clearances_change_by_millimetres_only() -> None:
 
 def test_another_arms_calibration_is_refused() -> None:
     other = replace(UR5, delta_a=np.array([0.0, -0.187, -0.18, 0.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"moves the forearm of a nominal UR5 by up to \d+ mm"):
-        CollisionModel(other, d405_mount(), BENCH, 0.01)
+    refused(r"moves the forearm of a nominal UR5 by up to \d+ mm", model, other, cell=BENCH)
     uncancelled = replace(UR5, delta_d=np.array([0.0, 11.198, -92.527, 0.0, 0.0, 0.0]))
     refused("calibration file another arm's", link_placements, arm_of(uncancelled))

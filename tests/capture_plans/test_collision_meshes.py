@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from given_plans import BENCH
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5, arm_of
@@ -15,10 +16,7 @@ try:
 except MissingLibraryError as error:
     pytest.skip(str(error), allow_module_level=True)
 
-INF = np.inf
-TABLE = Box(lower=(-0.6, -0.8, -INF), upper=(1.0, 0.8, 0.0))
 NOWHERE = Box(lower=(3, 3, 3), upper=(4, 4, 4))
-BENCH = WorkCell(table=TABLE, keep_out=Box(lower=(0.225, -0.15, -INF), upper=(0.525, 0.15, 0.12)))
 IN_THE_AIR = WorkCell(table=Box(lower=(-4, -4, -4), upper=(4, 4, -2)), keep_out=NOWHERE)
 SPLITS = 8
 

@@ -10,17 +10,16 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from given_plans import BENCH
 from realsim.errors import RealsimError, UnitError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
-from realsim.robots.shapes import Box, Mount, Shape, WorkCell
+from realsim.robots.shapes import Mount, Shape
 from realsim_capture_plans.collision.cell_files import read_mount, read_work_cell_obstacles
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import CAMERA_BODIES, d405_mount, plain_bracket
 from refusals import refused
 
-KEEP_OUT = Box(lower=(0.225, -0.15, -np.inf), upper=(0.525, 0.15, 0.12))
-CELL = WorkCell(table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)), keep_out=KEEP_OUT)
 GOOD = """
 name = "left bracket"
 camera = "D405"
@@ -178,7 +177,7 @@ def test_the_plain_bracket_joins_flange_and_camera(camera: str) -> None:
 
     for a, b in pairwise([*mount.bracket, camera_shape(mount)]):
         assert gap(a, b) <= 1e-6
-    assert CollisionModel(UR5, mount, CELL, 0.01).mount_gap_m > 0
+    assert CollisionModel(UR5, mount, BENCH, 0.01).mount_gap_m > 0
 
 
 def test_obstacles_are_read_and_wrong_ones_named(tmp_path: Path) -> None:

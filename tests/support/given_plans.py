@@ -12,7 +12,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.arm import UR5, find_arm
 from realsim.robots.kinematics import DhChain
-from realsim.robots.shapes import Box
+from realsim.robots.shapes import Box, WorkCell
 from realsim_capture_plans.capturing.look import CaptureConfig, SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, Stop
@@ -24,6 +24,11 @@ MOUNT = d405_mount(se3.exp([0.02, -0.1, 0.3, 0.0, -0.065, 0.035]))
 UR5_HOME = find_arm("ur5").home
 TURNED_HOME = UR5_HOME + np.pi * np.eye(6)[0]
 """On the side where the table is."""
+BENCH = WorkCell(
+    table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),
+    keep_out=Box(lower=(0.225, -0.15, -np.inf), upper=(0.525, 0.15, 0.12)),
+)
+"""A table in front of a UR5, with a box over the objects that is kept free."""
 QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 """For arms that stand at once."""
 
@@ -79,6 +84,14 @@ def joints_looking_at(center: Array, eyes: Iterable[Array], home: Array) -> list
         q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
         joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
     return joints
+
+
+def ring_plan(center: Array, home: Array, views: int) -> CapturePlan:
+    """A calibration plan of views on a narrow ring that look down at a point of the table."""
+    turns = np.linspace(0.0, 2 * np.pi, views, endpoint=False)
+    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
+    joints = np.stack(joints_looking_at(center, eyes, home))
+    return plan_through(joints, home, center, "calibration")
 
 
 def stopped(
