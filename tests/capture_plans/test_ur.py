@@ -29,6 +29,7 @@ from realsim_capture_plans.devices.ur_link import detected_model, trouble
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.devices.ur_loopback.robot import Motion
 from refusals import refused
+from waiting import comes_about
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 TCP = [0.01, -0.02, 0.12, 0.1, 0.4, -1.2]
@@ -66,10 +67,6 @@ def arm(controller: LoopbackController) -> Iterator[UrArm]:
         yield arm
 
 
-def goals(n: int, seed: int = 0) -> np.ndarray:
-    return HOME + np.random.default_rng(seed).uniform(-0.8, 0.8, (n, 6))
-
-
 # --- where it is --------------------------------------------------------------------------------
 
 
@@ -80,7 +77,7 @@ def test_arrives_where_it_is_sent_whatever_the_tool(cb3: LoopbackController) -> 
         assert arm.description["tool_offset_xyz_rotvec"] == pytest.approx(TCP)
         assert arm.description["polyscope"].startswith("3.15")
         assert arm.description["serial_number"] is None
-        for goal in goals(3):
+        for goal in HOME + np.random.default_rng(0).uniform(-0.8, 0.8, (3, 6)):
             arm.move(goal, speed=2.0, acceleration=3.0)
             state = arm.state()
             np.testing.assert_allclose(state.joints, goal, atol=1e-12)
@@ -225,10 +222,8 @@ def test_after_a_killed_capture_the_arm_stands_and_the_next_one_goes_on(
     workers = children(capture.pid)
     capture.kill()
     capture.wait()
-    end = time.monotonic() + 30.0
-    while any(command_line(p) for p in workers):
-        assert time.monotonic() < end, "ur_rtde's process outlives its capture"
-        time.sleep(0.02)
+    gone = comes_about(lambda: not any(command_line(p) for p in workers))
+    assert gone, "ur_rtde's process outlives its capture"
     stands = np.array(controller.joints())
     assert 0.0 < (stands - HOME).max() < 1.4
     time.sleep(0.1)
@@ -353,10 +348,8 @@ def test_ends_with_its_parent() -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).stdout
     (pid,) = [int(word) for word in said.split()]
-    end = time.monotonic() + 30.0
-    while command_line(pid):
-        assert time.monotonic() < end, "a loopback controller outlives its parent"
-        time.sleep(0.02)
+    gone = comes_about(lambda: not command_line(pid))
+    assert gone, "a loopback controller outlives its parent"
 
 
 def test_messages_of_modes() -> None:
