@@ -213,13 +213,13 @@ def test_any_arm_of_six_axes_comes_back_from_its_dh_numbers() -> None:
         assert np.abs(chain.forward(q) - by_links(links, q)).max() < 1e-9
 
 
-@pytest.mark.parametrize("name", ["UR10", "UR5e"])
-def test_the_inverse_is_complete_on_real_calibrations(name: str, tmp_path: Path) -> None:
-    if name == "UR10":
-        nominal, chain = UR10, read(conf(CONF), UR10, tmp_path)
-    else:
-        nominal = NOMINAL[name]
-        chain = read(ros_yaml(ROS[name]), nominal, tmp_path, "robot.yaml")
+@pytest.mark.parametrize(
+    ("nominal", "text"), [(UR10, conf(CONF)), (UR5E, ros_yaml(ROS["UR5e"]))], ids=["UR10", "UR5e"]
+)
+def test_the_inverse_is_complete_on_real_calibrations(
+    nominal: DhChain, text: str, tmp_path: Path
+) -> None:
+    chain = read(text, nominal, tmp_path)
     q = regular_joints(nominal, 100)
     Ts = chain.forward(q)
     found, owner = chain.inverse_branches(Ts)

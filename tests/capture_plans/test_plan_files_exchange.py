@@ -255,10 +255,13 @@ def test_no_path_ends_in_a_traceback(tmp_path: Path) -> None:
 
 def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
     through = HOME + np.array([0.0, 0.9, -0.2, 0.0, 0.0, 0.0])  # the camera goes into the table
-    header = HEADER.format(u="rad")
-    rows = [",".join(map(repr, q.tolist())) for q in (HOME, through, HOME)]
-    (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
-    plan = imported(tmp_path / "p.csv", UR5)
+
+    def plan_of_rows(*joints: np.ndarray, **options: Any) -> CapturePlan:
+        rows = [",".join(map(repr, q.tolist())) for q in joints]
+        (tmp_path / "p.csv").write_text("\n".join([HEADER.format(u="rad"), *rows]))
+        return imported(tmp_path / "p.csv", UR5, **options)
+
+    plan = plan_of_rows(HOME, through, HOME)
     assert len(plan) == 3 and plan.metrics["colliding_legs"] == 2
     lines = colliding_legs(plan)
     assert len(lines) == 2
@@ -266,10 +269,8 @@ def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
     # An obstacle in free air is found too.
     air = plan.chain.forward(HOME)[:3, 3]
     lamp = Box(lower=tuple(air - 0.05), upper=tuple(air + 0.05))
-    rows = [",".join(map(repr, q.tolist())) for q in (HOME, HOME + 0.01)]
-    (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
     for boxes, count in (((), 0), ((("lamp", lamp),), 2)):
-        plan = imported(tmp_path / "p.csv", UR5, obstacles=boxes)
+        plan = plan_of_rows(HOME, HOME + 0.01, obstacles=boxes)
         assert plan.metrics["colliding_legs"] == count
 
 
@@ -372,8 +373,7 @@ def test_degrees_and_millimetres_are_named(tmp_path: Path) -> None:
     def small_degrees(data: dict[str, Any]) -> None:
         # poses as the radians give them, joints so near zero that no number is suspicious
         q = np.array(data["content"]["joints"])
-        near = replace(a_plan(), joints=q * 0.02, home=HOME * 0.02, vias=())
-        data |= plan_to_json(near)
+        data |= plan_to_json(replace(a_plan(), joints=q * 0.02, home=HOME * 0.02, vias=()))
         degrees(data)
 
     assert "degrees; radians are needed" in said_when(small_degrees, tmp_path)

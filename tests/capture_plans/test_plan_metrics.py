@@ -282,8 +282,7 @@ def test_the_clearance_picture_names_the_worst_spot_of_every_group(curves: PlanC
 
 def test_a_plan_that_does_not_keep_its_clearance_is_said_not_to_be_driven() -> None:
     plan = make()
-    broken = PlanCurves.of(replace(plan, vias=((3, DIVE[None]),)))
-    shown = texts(clearance_chart(broken))
+    shown = texts(clearance_chart(PlanCurves.of(replace(plan, vias=((3, DIVE[None]),)))))
     assert "NOT KEPT" in shown and "move to view 3" in shown
     safe = PlanCurves.of(replace(plan, joints=LOOKING[None] + [[0.3, 0, 0, 0, 0, 0]], vias=()))
     assert "kept everywhere" in texts(clearance_chart(safe))
