@@ -19,6 +19,7 @@ from realsim.scanning.scale.outlines import COLUMNS, Rims, add_outline, outline
 from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import OBJECT, PATCHES, RIM, SIZE, ScaleState, moved_state
 from scanned_objects import Scanned, evidence_of, gathered, scanned, shape_of, true_state
+from table_faults import without_any_depth
 
 STEP = 1e-6
 SHARED = PATCHES + 1
@@ -292,7 +293,7 @@ def test_a_view_that_does_not_see_the_object_is_named():
     known = scanned("block")
     T = known.frames[3].T_world_cam @ se3.exp([0, np.pi, 0, 0, 0, 0])
     away = replace(known.frames[3], T_world_cam=T)
-    blind = replace(known.frames[5], depth_m=np.zeros_like(known.frames[5].depth_m))
+    blind = without_any_depth(known.frames[5])
     frames = (*known.frames[:3], away, known.frames[4], blind, *known.frames[6:])
     evidence = gathered(Scanned(known.real, known.scan, replace(known.views, frames=frames)))
     assert evidence.unseen == (3, 5)
