@@ -208,9 +208,8 @@ def test_shells_within_shells_give_the_volume_of_the_material():
 
 
 def test_texture_seams_stay_and_the_surface_is_closed_all_the_same():
-    corners = box()
     # Every side has its own four vertices and its own coordinates: all edges of the box are seams.
-    mesh = soup(corners)
+    mesh = soup(box())
     uv = np.random.default_rng(0).random((len(mesh.vertices), 2))
     texture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     mesh = replace(mesh, uv=uv, texture=texture)

@@ -101,8 +101,7 @@ def test_errors_that_all_objects_share_raise_the_bound_but_not_without_end(watch
     scene, _, poses, residuals = watched
     exact = error_level_m(residuals(poses))
     # Cameras 1.2 mm too near along their axes: depth bias of a cheap camera.
-    biased = scene.Ts_world_cam @ se3.from_translation([0, 0, 0.0012])
-    results = residuals(poses, biased)
+    results = residuals(poses, scene.Ts_world_cam @ se3.from_translation([0, 0, 0.0012]))
     level = error_level_m(results)
     assert exact < 0.0004 < level <= LEVEL_M[1]
     assert wrong_bound_m(exact) == WRONG_M

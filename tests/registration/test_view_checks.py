@@ -234,8 +234,7 @@ def test_reasons_are_given_where_there_is_no_table():
     found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], NOISE)
     assert found.plane is None and "largest plane" in found.reason
     view = views_at(1)[0]
-    empty = replace(view, points=view.points[:0], pixels=view.pixels[:0])
-    found = find_table([empty], NOISE)
+    found = find_table([replace(view, points=view.points[:0], pixels=view.pixels[:0])], NOISE)
     assert found.plane is None and "0 trusted points" in found.reason
 
 
