@@ -53,8 +53,8 @@ def middle_of(pose, model):
     return se3.transform(pose.T_world_obj, model.mesh.bounds.mean(0))[0]
 
 
-def check_region(hint, model, scene, pose):
-    region = region_of(hint, model, scene)
+def check_region(region, model, pose):
+    """Hold that a region holds the middle of the object."""
     assert region is not None
     assert np.linalg.norm(region.center_world - middle_of(pose, model)) <= region.radius_m
 
@@ -83,12 +83,12 @@ def test_boxes_and_masks_lead_to_the_object():
         x, y = float(columns.min()), float(rows.min())
         xywh = (x - 3, y - 3, float(np.ptp(columns)) + 7, float(np.ptp(rows)) + 7)
         box = Hint(obj_id=pose.obj_id, instance=0, where=Box(view=view, xywh=xywh))
-        check_region(box, model, scene, pose)
+        check_region(region_of(box, model, scene), model, pose)
         # A network's mask: too fat by 4 px, so that it holds table and neighbours.
         exact = (shown[view] == pose.instance).astype(np.uint8)
         fat = np.asarray(cv2.dilate(exact, np.ones((9, 9), np.uint8))) > 0
         mask = Hint(obj_id=pose.obj_id, instance=0, where=Marked(view=view, inside=fat))
-        check_region(mask, model, scene, pose)
+        check_region(region_of(mask, model, scene), model, pose)
         tried += 1
     assert tried > 15
 
@@ -99,7 +99,7 @@ def test_without_depth_the_table_tells():
     for view, pose, model, rows, columns in seen_well():
         click = Click(view=view, pixel=(float(np.median(columns)), float(np.median(rows))))
         hint = Hint(obj_id=pose.obj_id, instance=0, where=click)
-        check_region(hint, model, blind, pose)
+        check_region(region_of(hint, model, blind), model, pose)
         refused("no depth is measured", region_of, hint, model, replace(blind, plane=None))
     assert len(scene_.truth) == 6
 
@@ -193,10 +193,7 @@ def test_hints_are_read_from_the_file(store):
     assert isinstance(mask, Marked) and np.array_equal(mask.inside, inside)
     wanted = read_starts(path, part_models(), store)
     assert [w.region is None for w in wanted] == [False, False, False, True, False]
-    region = wanted[4].region
-    assert region is not None
-    true = middle_of(scene.truth[4], scene.models[e])
-    assert np.linalg.norm(region.center_world - true) <= region.radius_m
+    check_region(wanted[4].region, scene.models[e], scene.truth[4])
 
 
 EYE = np.eye(4).tolist()

@@ -11,13 +11,13 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.registration.evidence import DepthFrame
 from realsim.registration.refinement.equations import BIAS, HAND_EYE_AT
 from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.joint import joint_fit
 from realsim.scanning.scale.result import ScaleFit, Similarity
 from realsim.scanning.scale.state import SIZE
 from refusals import refused
+from table_faults import without_any_depth
 
 
 def z_of(fit: ScaleFit) -> float:
@@ -148,7 +148,7 @@ def test_a_slipped_view_is_left_out_and_a_blind_one_named():
     slip = se3.from_rt(se3.exp_so3([np.radians(2.0), 0, 0]), [0, 0.006, 0])
     frames = list(known.frames)
     frames[4] = replace(frames[4], T_world_cam=frames[4].T_world_cam @ slip)
-    frames[6] = replace(frames[6], depth_m=np.zeros_like(frames[6].depth_m))
+    frames[6] = without_any_depth(frames[6])
     fit = lab.fit_of(known, frames=tuple(frames))
     assert [v.index for v in fit.views] == list(range(10))
     assert [v.index for v in fit.views if not v.used] == [4, 6]
@@ -227,16 +227,12 @@ def test_several_objects():
         lab.fit_of(known, as_scan("block"), start=None)
 
 
-def blind(frame: DepthFrame) -> DepthFrame:
-    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
-
-
 @pytest.mark.parametrize(
     ("frames", "said"),
     [
         (lambda f: (), "no depth frames"),
         (lambda f: f[:2], r"2 views .* at least 3 from different sides .* 12 or more"),
-        (lambda f: [blind(g) for g in f], r"10 depth images .*Is the depth all zero\?"),
+        (lambda f: [without_any_depth(g) for g in f], r"10 depth images .*Is the depth all zero\?"),
         (lambda f: [replace(g, depth_m=g.depth_m * np.float32(1000)) for g in f],
          r"(?i)millimet|unit|metres"),
         (lambda f: [replace(g, depth_m=(1e4 * g.depth_m).astype(np.uint16)) for g in f],
@@ -299,8 +295,7 @@ def test_an_open_mesh_is_fitted_too():
 @pytest.mark.slow
 def test_poses_of_other_images_are_not_accepted():
     known = lab.scanned("bunny")
-    others = known.frames[3:] + known.frames[:3]
-    exchanged = zip(known.frames, others, strict=True)
+    exchanged = zip(known.frames, known.frames[3:] + known.frames[:3], strict=True)
     frames = tuple(replace(f, T_world_cam=other.T_world_cam) for f, other in exchanged)
     try:
         fit = lab.fit_of(known, frames=frames)
