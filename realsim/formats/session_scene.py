@@ -7,7 +7,7 @@ Frames keep the numbers that they had in the data set they were imported from.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -194,6 +194,23 @@ class SessionScene:
         )
 
 
+def _notes_on_grasps(store: SessionStore, scene: Scene) -> Iterator[str]:
+    """Yield what a person should know of grasps that were tried in another scene than this."""
+    tried = load_grasps(store)
+    kept = grasps_on(scene, tried)
+    again = f"run `realsim school {store.folder.name} --restart` and annotate again."
+    if moved := _moved_since_tried(scene, kept):
+        yield (
+            f"the grasps of {len(moved)} object{'s' if len(moved) > 1 else ''} were tried where "
+            f"they no longer stand (moved by up to {1e3 * max(moved):.1f} mm): {again}"
+        )
+    if gone := len(tried) - len(kept):
+        yield (
+            f"the grasps of {gone} object{'s' if gone > 1 else ''} stay out: they were tried on an "
+            f"object that is another now, or no more there: {again}"
+        )
+
+
 def _moved_since_tried(scene: Scene, sets: Sequence[GraspSet]) -> list[float]:
     """Return how far objects have been moved on the table since their grasps were tried [m]."""
     if scene.plane is None:
@@ -201,10 +218,10 @@ def _moved_since_tried(scene: Scene, sets: Sequence[GraspSet]) -> list[float]:
     T_table_world = se3.invert(scene.plane.T_world_table)
     stands = {o.instance: T_table_world @ o.T_world_obj for o in scene.objects}
     moved: list[float] = []
-    for tried in grasps_on(scene, sets):
+    for tried in sets:
         then = np.array((tried.parameters.get("inputs") or {}).get("T_table_obj", np.nan))
-        now = stands.get(tried.instance)
-        if now is not None and then.shape == (4, 4):
+        now = stands[tried.instance]
+        if then.shape == (4, 4):
             corners = 0.05 * np.vstack([np.zeros(3), np.eye(3)])
             apart = se3.transform(now, corners) - se3.transform(then, corners)
             moved.append(float(np.linalg.norm(apart, axis=1).max()))
@@ -266,18 +283,8 @@ def open_session_scene(
         notes.append("it has no labels: images and cameras only.")
     if scene is None and store.has("registration/scene.json"):
         scene = load_scene(store)
-    sets = [] if scene is None else load_grasps(store)
-    again = f"run `realsim school {store.folder.name} --restart` and annotate again."
-    if scene is not None and (moved := _moved_since_tried(scene, sets)):
-        notes.append(
-            f"the grasps of {len(moved)} object{'s' if len(moved) > 1 else ''} were tried where "
-            f"they no longer stand (moved by up to {1e3 * max(moved):.1f} mm): {again}"
-        )
-    if scene is not None and (gone := len(sets) - len(grasps_on(scene, sets))):
-        notes.append(
-            f"the grasps of {gone} object{'s' if gone > 1 else ''} stay out: they were tried on an "
-            f"object that is another now, or no more there: {again}"
-        )
+    if scene is not None:
+        notes += _notes_on_grasps(store, scene)
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
         (store, scene),
