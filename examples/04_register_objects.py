@@ -4,8 +4,7 @@ import numpy as np
 
 from realsim import CameraIntrinsics, Mesh, ObjectPose
 from realsim.geometry import se3
-from realsim.geometry.mesh import symmetry_transforms
-from realsim.geometry.metrics import mssd
+from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
 from realsim.registration.register import DepthFrame, register_scene
 from realsim.rendering.depth_sensors.model import DepthSensorModel
@@ -50,7 +49,6 @@ result = register_scene("three parts", intrinsics, frames, models, starts)
 print("object         start    six views   one view   verdict")
 for i, (model, start) in enumerate(zip(parts, starts, strict=True)):
     found = (start, result.scene.object(i), result.single_view.object(i))
-    turns = symmetry_transforms(model, max_step_rad=0.005)  # round parts: fine steps
-    mm = [1e3 * mssd(truth[i], p.T_world_obj, model.mesh.vertices, turns) for p in found]
+    mm = [1e3 * mssd_symmetric(truth[i], p.T_world_obj, model) for p in found]
     verdict = result.scene.object(i).verdict
     print(f"{model.name:12s} {mm[0]:5.1f} mm   {mm[1]:6.2f} mm  {mm[2]:6.2f} mm   {verdict}")

@@ -7,15 +7,11 @@ import numpy as np
 
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry import se3
-from realsim.geometry.mesh import symmetry_transforms
-from realsim.geometry.metrics import mask_iou, mssd
+from realsim.geometry.metrics import mask_iou, mssd_symmetric
 from realsim.records import Scene
 from realsim.store import SessionStore
 from realsim_capture_plans.lab import LabTruth, load_truth
 
-SYMMETRY_STEP_RAD = 0.002
-"""Step of continuous symmetries: with the usual 0.1 rad a round body 60 mm in radius would seem to
-be up to 3 mm off."""
 IOU_VIEWS = 24
 """Masks are compared with the true ones in at most so many views, evenly spread."""
 GOALS = {"handeye_mm": 0.5, "handeye_deg": 0.1, "object_mssd_mm": 1.0, "mask_iou": 0.95}
@@ -101,12 +97,7 @@ def loop_errors(store: SessionStore, truth_folder: Path) -> LoopErrors:
     def object_errors(scene: Scene) -> dict[int, float]:
         return {
             o.instance: 1e3
-            * mssd(
-                true_objects[o.instance],
-                o.T_world_obj,
-                models[o.obj_id].mesh.vertices,
-                symmetry_transforms(models[o.obj_id], SYMMETRY_STEP_RAD),
-            )
+            * mssd_symmetric(true_objects[o.instance], o.T_world_obj, models[o.obj_id])
             for o in scene.objects
         }
 
