@@ -226,21 +226,25 @@ class Console:
         Where it is too wide for its words, each row becomes a block of lines instead: no number is
         cut in two.
         """
+        from rich.text import Text
+
         if self.as_json:
             return
         cells = [[str(cell) for cell in row] for row in rows]
         if self._told is not None:
             self._told.tables.append((title, header, cells))
-        elif _least_width(header, cells) > self._out.width:
-            self._blocks(title, header, cells)
+            return
+        self._out.print(Text(title, style="bold"))
+        if _least_width(header, cells) > self._out.width:
+            self._blocks(header, cells)
         else:
-            self._grid(title, header, cells)
+            self._grid(header, cells)
 
-    def _grid(self, title: str, header: Sequence[str], cells: list[list[str]]) -> None:
+    def _grid(self, header: Sequence[str], cells: list[list[str]]) -> None:
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(title=title, title_justify="left", title_style="bold")
+        table = Table()
         for k, name in enumerate(header):
             table.add_column(
                 Text(name),
@@ -252,11 +256,10 @@ class Console:
             table.add_row(*[Text(cell) for cell in row])
         self._out.print(table)
 
-    def _blocks(self, title: str, header: Sequence[str], cells: list[list[str]]) -> None:
+    def _blocks(self, header: Sequence[str], cells: list[list[str]]) -> None:
         """Print each row as lines of `name  value`."""
         from rich.text import Text
 
-        self._out.print(Text(title, style="bold"))
         for row in cells:
             self._out.print(Text(row[0] if row else ""))
             for name, cell in zip(header[1:], row[1:], strict=False):

@@ -15,8 +15,8 @@ LIST = Numbers()
 
 
 def one_of(words: str) -> click.Choice[str]:
-    """Return the type of a choice among words."""
-    return click.Choice(words.split())
+    """Return the type of a choice among words, in capitals or not."""
+    return click.Choice(words.split(), case_sensitive=False)
 
 
 SENSORS = one_of("d405 d415 d435 structured_light")
