@@ -194,8 +194,12 @@ class SessionScene:
         )
 
 
-def _notes_on_grasps(store: SessionStore, scene: Scene) -> Iterator[str]:
-    """Yield what a person should know of grasps that were tried in another scene than this."""
+def notes_on_grasps(store: SessionStore, scene: Scene) -> Iterator[str]:
+    """Yield what a person should know of grasps that were tried in another scene than this.
+
+    Raises:
+        InputError: a file of grasps is broken, or of a newer format.
+    """
     tried = load_grasps(store)
     kept = grasps_on(scene, tried)
     again = f"run `realsim school {store.folder.name} --restart` and annotate again."
@@ -284,7 +288,7 @@ def open_session_scene(
     if scene is None and store.has("registration/scene.json"):
         scene = load_scene(store)
     if scene is not None:
-        notes += _notes_on_grasps(store, scene)
+        notes += notes_on_grasps(store, scene)
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
         (store, scene),

@@ -24,7 +24,7 @@ from realsim.review.content.views import Region, region_of, strided
 from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
-from realsim.store import SessionStore
+from realsim.store import SessionStore, save_grasps
 from refusals import refused
 from reviewed_boxes import CAMERAS, CONFIG, boxes_session, grasp_set
 
@@ -131,6 +131,14 @@ def test_views_with_damaged_images_are_left_out_and_named(
         assert "is left out" in said and name in said
     found = nearest_m(left.cloud.points.astype(float), shown.cloud.points.astype(float))
     assert 0 < len(left.cloud) < len(shown.cloud) and found.max() < CONFIG.voxel_m
+
+
+def test_grasps_of_another_object_are_not_shown_and_it_is_told(tmp_path: Path) -> None:
+    store = boxes_session(tmp_path / "s")
+    save_grasps(store, grasp_set(7, 0))
+    content = SceneContent.load(store, CONFIG)
+    assert 7 not in {g.obj_id for g in content.grasp_sets if g.instance == 0}
+    assert "of 1 object stay out" in content.remarks[0]
 
 
 def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from realsim.arrays import Array, UInt8, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, model_file, require_meshes
+from realsim.formats.session_scene import notes_on_grasps
 from realsim.images import resized
 from realsim.interop import give_back_memory
 from realsim.pages.pictures import jpeg_bytes
@@ -194,6 +195,8 @@ class SceneContent:
     is not among the views."""
     grasp_sets: tuple[GraspSet, ...]
     """Grasp sets of the objects of the scene."""
+    grasp_notes: tuple[str, ...]
+    """What a person should know of grasps that were tried in another scene."""
 
     @staticmethod
     def load(
@@ -246,6 +249,7 @@ class SceneContent:
             thumbnails=thumbnails.of([v.index for v in shown], damaged, progress),
             damaged=damaged,
             grasp_sets=tuple(grasps_on(scene, load_grasps(store))),
+            grasp_notes=tuple(notes_on_grasps(store, scene)),
         )  # fmt: skip
 
     def pose_of(self, view: int) -> Array:
@@ -263,8 +267,9 @@ class SceneContent:
 
     @property
     def remarks(self) -> list[str]:
-        """Which views are left out because their images cannot be read, and why."""
-        return [f"View {k} is left out: {why}" for k, why in sorted(self.damaged.items())]
+        """Which views are left out because their images cannot be read, and notes on grasps."""
+        left_out = [f"View {k} is left out: {why}" for k, why in sorted(self.damaged.items())]
+        return [*left_out, *self.grasp_notes]
 
     def grasps_of(self, instance: int) -> GraspSet | None:
         """Return the grasps of an object; None = it has none."""
