@@ -114,7 +114,7 @@ def test_a_missing_model_is_named(tmp_path: Path) -> None:
     refused(r"objects 7.*it has 1, 9", SceneContent.load, store, CONFIG)
 
 
-def test_views_with_damaged_images_are_left_out_and_named(
+def test_views_with_damaged_images_and_grasps_of_another_object_are_left_out_and_named(
     tmp_path: Path, shown: SceneContent
 ) -> None:
     store = boxes_session(tmp_path / "boxes")
@@ -124,21 +124,15 @@ def test_views_with_damaged_images_are_left_out_and_named(
     store.add_view(View(index=7, T_world_cam=CAMERAS[0]), store.rgb(0))
     store.path("rgb/000007.png").unlink()
     store.path("depth/000002.png").write_bytes(png_bytes(np.full((60, 80), 4000, np.uint16)))
+    save_grasps(store, grasp_set(7, 0))  # of what was instance 0 before
     left = SceneContent.load(SessionStore.open(store.folder), CONFIG)
     assert sorted(left.damaged) == [1, 2, 3, 7] and sorted(left.thumbnails) == [0, 2, 3]
-    names = ("rgb/000001", "(60, 80)", "depth/000003", "View 7")
+    assert [g.obj_id for g in left.grasp_sets] == [1, 7]
+    names = ("rgb/000001", "(60, 80)", "depth/000003", "View 7", "of 1 object stay out")
     for said, name in zip(left.remarks, names, strict=True):
-        assert "is left out" in said and name in said
+        assert " out: " in said and name in said
     found = nearest_m(left.cloud.points.astype(float), shown.cloud.points.astype(float))
     assert 0 < len(left.cloud) < len(shown.cloud) and found.max() < CONFIG.voxel_m
-
-
-def test_grasps_of_another_object_are_not_shown_and_it_is_told(tmp_path: Path) -> None:
-    store = boxes_session(tmp_path / "s")
-    save_grasps(store, grasp_set(7, 0))
-    content = SceneContent.load(store, CONFIG)
-    assert 7 not in {g.obj_id for g in content.grasp_sets if g.instance == 0}
-    assert "of 1 object stay out" in content.remarks[0]
 
 
 def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:
