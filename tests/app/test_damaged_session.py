@@ -73,8 +73,7 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
 def test_a_damaged_note_is_no_note(registered: Path, tmp_path: Path) -> None:
     store = SessionStore.open(copy_of(registered, tmp_path / "s"))
     store.path("stages/register.json").write_text('{"key": "abc')
-    scene = register_session(store, QUIET)
-    assert scene.objects[0].verdict == "accepted"
+    assert register_session(store, QUIET).objects[0].verdict == "accepted"
     assert "key" in json.loads(store.path("stages/register.json").read_text())
 
 

@@ -170,8 +170,7 @@ def test_seven_joints_come_too_and_are_the_named_arms(tmp_path):
     names = " ".join(f"q{k + 1}_rad" for k in range(7))
     file.write_text("\n".join([f"{header} {names}", *lines]) + "\n")
     request = ImportRequest(source=folder, depth_unit=0.001, depth_coding="plain", arm="panda")
-    summary = run_import(request, tmp_path / "s", QUIET)
-    assert summary.with_joints == 6
+    assert run_import(request, tmp_path / "s", QUIET).with_joints == 6
     for v in SessionStore.open(tmp_path / "s").session.views:
         np.testing.assert_allclose(v.joints, q[f"rgb_{v.index:03d}.png"])
     why = r"7 joint angles.*--arm ur5, a UR5, has 6.*Panda"

@@ -221,8 +221,7 @@ def test_points_lie_on_the_scene_with_its_colours(store, tmp_path):
     assert heights.min() > -0.04 and heights.max() < 0.14
     assert np.median(np.abs(heights)) < 0.01
     assert len({tuple(p.color) for p in model.points3D.values()}) > 20
-    none = written(store, tmp_path / "none", points=0)
-    assert none.counts["points"] == 0
+    assert written(store, tmp_path / "none", points=0).counts["points"] == 0
     assert len(pycolmap.Reconstruction(str(tmp_path / "none/sparse/0")).points3D) == 0
 
 

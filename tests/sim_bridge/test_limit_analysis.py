@@ -93,8 +93,7 @@ def test_another_solver_finds_the_same_optimum(tilt, friction):
 def test_the_factor_is_force_over_load_and_grows_with_friction():
     p, w = patches(30, seed=3), loads(30, 4, seed=4)
     found = borne(p, w, 0.5, 10)
-    held = found > 0
-    assert held.mean() > 0.5
+    assert (found > 0).mean() > 0.5
     np.testing.assert_allclose(borne(p, w, 0.5, 70), 7 * found, rtol=1e-9)
     np.testing.assert_allclose(borne(p, 4 * w, 0.5, 10), found / 4)
     last = np.zeros_like(found)
