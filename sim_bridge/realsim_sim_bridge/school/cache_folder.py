@@ -202,28 +202,26 @@ def folder_of_run(folder: Path, record: dict[str, Any], *, restart: Restart) -> 
     with only_run_in(folder):
         for leftover in folder.glob(f".{RESULTS}.*"):  # of a process killed while it wrote
             leftover.unlink()
-        path = folder / RUN_FILE
-        if restart is True or (restart == "finished" and _gives_way(folder, path, record)):
-            (folder / FINISHED_FILE).unlink(missing_ok=True)
+        path, finished = folder / RUN_FILE, folder / FINISHED_FILE
+        if restart and (restart is True or finished.is_file()) and _is_of_another(path, record):
+            finished.unlink(missing_ok=True)
             # The record goes last: killed in between, the folder still says whose results remain.
             for result in folder.glob(RESULTS):
                 result.unlink()
         else:
             _refuse_others(folder, path, record)
-            (folder / FINISHED_FILE).unlink(missing_ok=True)
+            finished.unlink(missing_ok=True)
         # Not strict JSON: a config may hold infinity.
         atomic.write_text(path, json.dumps(record, indent=1) + "\n")
         yield
 
 
-def _gives_way(folder: Path, path: Path, record: dict[str, Any]) -> bool:
-    """Return whether the folder holds a finished run of something else."""
-    if not ((folder / FINISHED_FILE).is_file() and path.is_file()):
-        return False
+def _is_of_another(path: Path, record: dict[str, Any]) -> bool:
+    """Return whether results beside a record are not known to be of this run."""
     try:
         old = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        return False
+    except (FileNotFoundError, ValueError):
+        return True
     return any(True for _ in provenance.differences(old, record))
 
 
@@ -254,14 +252,17 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
         ) from None
     changed = [(f, *map(provenance.in_short, v)) for f, *v in provenance.differences(old, record)]
     if changed:
-        told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed[:MOST_TOLD])
-        if len(changed) > MOST_TOLD:
-            told += f"\n  and {len(changed) - MOST_TOLD} more"
+        # Another hand or arm has other values in many fields.
+        told = [c for c in changed if c[0].endswith(("hand.name", "arm.name"))]
+        told = told or changed[:MOST_TOLD]
+        listed = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in told)
+        if len(changed) > len(told):
+            listed += f"\n  and {len(changed) - len(told)} more"
         numbers = {m[1] for field, *_ in changed if (m := re.match(OBJECT_FIELD, field))}
         moved = ""
         if numbers:
             which = ", ".join(str(int(n)) for n in sorted(numbers))
             moved = f" Objects, or what is around them, were moved or exchanged (instance {which})."
         raise InputError(
-            f"{folder} holds a run that was started with something else.{moved}{told}\n{remedy}"
+            f"{folder} holds a run that was started with something else.{moved}{listed}\n{remedy}"
         )
