@@ -16,6 +16,7 @@ from click.core import ParameterSource
 
 from realsim.app.command import (
     ENVIRONMENT,
+    LONGEST_SENTENCE,
     default_of,
     settable,
     spelling,
@@ -126,7 +127,7 @@ def template(commands: Commands) -> str:
         options = settable(command)
         if not options:
             continue
-        lines = [f"\n# {command.get_short_help_str(90)}", f"[{'.'.join(path)}]"]
+        lines = [f"\n# {command.get_short_help_str(LONGEST_SENTENCE)}", f"[{'.'.join(path)}]"]
         for option in options:
             told = " ".join((option.help or "").split())
             lines.append(f"## {told} ({_many(option)}{kind_of(option)})")
