@@ -244,7 +244,7 @@ class Console:
         from rich.table import Table
         from rich.text import Text
 
-        table = Table()
+        table = Table(show_header=any(header))
         for k, name in enumerate(header):
             table.add_column(
                 Text(name),

@@ -420,7 +420,7 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
         ["seconds", f"{summary.seconds:.1f}", ""],
     ]
     rows = [row for row in rows if row[1] or row[0] in ("visited", "captured")]
-    console.table("Dry run" if dry else "Capture", ["", "", "which"], rows)
+    console.table("Dry run" if dry else "Capture", ["what", "number", "which"], rows)
     if dry:
         console.say("nothing was stored.")
     console.warn(*summary.warnings)
