@@ -158,12 +158,14 @@ def _share_of(image: LabelledDepth, points: Mapping[int, Array]) -> float:
         uv = np.rint(project(image.intrinsics, placed))
     is_somewhere = (placed[:, 2] > NEAREST_M) & np.all(np.abs(uv) < BESIDE * width, axis=1)
     uv, z = uv[is_somewhere].astype(np.int64), placed[is_somewhere, 2]
-    by_depth = np.argsort(z, kind="stable")
-    _, first = np.unique(uv[by_depth] * CELLS // width, axis=0, return_index=True)
-    seen = by_depth[first]
-    (u, v), z = uv[seen].T, z[seen]
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    measured = image.depth_m[v[inside], u[inside]]
-    off = np.abs(measured - z[inside])
-    agree = np.count_nonzero((measured > 0) & (off < AGREES_M + AGREES_SHARE * z[inside]))
-    return agree / max(len(seen), 1) * float(np.mean(is_somewhere))
+    cells = np.floor(uv * CELLS / width).astype(np.int64)
+    inside = np.all((uv >= 0) & (uv < (width, height)), axis=1)
+    beside = np.unique(cells[~inside] @ (2 * int(BESIDE) * CELLS, 1))
+    (u, v), z, (column, row) = uv[inside].T, z[inside], cells[inside].T
+    nearest = np.full((CELLS, height * CELLS // width + 1), np.inf)
+    np.minimum.at(nearest, (column, row), z)
+    is_nearest = z == nearest[column, row]
+    z, measured = z[is_nearest], image.depth_m[v[is_nearest], u[is_nearest]]
+    agree = (measured > 0) & (np.abs(measured - z) < AGREES_M + AGREES_SHARE * z)
+    looked_at = len(z) + len(beside)
+    return float(np.count_nonzero(agree) / max(looked_at, 1) * np.mean(is_somewhere))
