@@ -353,6 +353,8 @@ _RANGES = {
     "finger_thickness_m": (0.0005, 0.1, "m"),
     "pad_width_m": (0.001, 0.3, "m"),
     "pad_length_m": (0.001, 0.3, "m"),
+    "arc_radius_m": (0.0, 0.5, "m"),
+    "arc_axis_y_m": (-0.5, 0.5, "m"),
     "friction": (0.01, 10.0, ""),
     "pad_stiffness_n_per_m": (1e3, STIFFEST_N_PER_M, "N/m"),
     "mass_kg": (0.01, 20.0, "kg"),
@@ -372,7 +374,8 @@ def _faults(hand: Hand) -> list[str]:
         value = getattr(hand, name)
         if least <= value <= most:
             continue
-        told = f"{name} is {value:g} {unit}; {least:g} to {most:g} {unit} can be"
+        told = f"{name} is {value:g} {unit}".rstrip()
+        told += f"; {least:g} to {most:g} {unit}".rstrip() + " is accepted"
         units = {"millimetres": 1e3, "centimetres": 1e2} if unit == "m" else {}
         meant = [f"{value / per:g} if {value:g} is in {what}" for what, per in units.items()
                  if least <= value / per <= most]  # fmt: skip

@@ -100,6 +100,8 @@ def test_what_a_killed_run_did_not_come_to_after_its_last_view_is_done_by_the_ne
          "--arm panda is a Panda with 7 joints, and the plan was made for a UR5e with 6"),
         (["--plan", "board_plan.json", "--simulated"], "--board does not say which"),
         (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
+        (["--plan", "plan.json", "--simulated", "--settle", "500"], "0 to 60 s is accepted"),
+        (["--plan", "plan.json", "--simulated", "--fixed-cameras", "left=2"], "one camera"),
         (["--plan", "plan.json", "--simulated", "--only-views", "0-1,9-11"], "[9, 10, 11]"),
         (["--plan", "plan.json", "--simulated", "--retake", "1-x"], "such as 1-3,7"),
     ],
@@ -120,7 +122,8 @@ def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_
     assert "begun with the plan" in said
     assert f"Choose a new folder, or go on with the plan in {session}/plan.json" in said
     words = ("--plan", plans / "plan.json", "--simulated")
-    assert "--seed" in complained("capture", session, *words, "--seed", "7")
+    said = complained("capture", session, *words, "--seed", "7")
+    assert "lab with --seed 0, --objects 5, not in the simulated lab with --seed 7" in said
     assert sorted((p, p.stat().st_mtime_ns) for p in session.rglob("*")) == before
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis/thesis.tex").write_text("precious")

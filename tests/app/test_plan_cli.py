@@ -10,6 +10,7 @@ from given_plans import plan_through
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim.robots.arm import UR5E
+from realsim.store.atomic import only_run_in
 from realsim_capture_plans.plan_files.foreign_plans import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan
@@ -48,6 +49,10 @@ def test_a_plan_is_made_and_written() -> None:
     assert plan.content_hash[:12] in done.stdout and "good" in done.stdout
     before = Path("a.json").read_bytes()
     assert "--overwrite" in complained(*words)
+    Path("b_pictures").mkdir()
+    with only_run_in(Path("b_pictures")):  # a second run at the same time
+        assert "another run" in complained("plan", "--views", 1, "--quiet", "--out", "b.json")
+    assert not Path("b.json").exists()
     assert Path("a.json").read_bytes() == before
 
 
@@ -68,6 +73,7 @@ def test_a_plan_comes_after_its_pictures_so_that_what_was_interrupted_is_run_aga
         ("--center 350,0,50", "'0.35,0,0.05'"),
         ("--center nan,0,0", "3 numbers"),
         ("--keep-out 300,300,120", "--keep-out"),
+        ("--keep-out 0.3,0.3,-0.12", "sizes of 0 or more"),
         ("--radius 0.4,0.3", "in this order"),
         ("--elevation 20,95", "90"),
         ("--board-views --elevation 20,80", "--elevation"),

@@ -257,6 +257,8 @@ def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
         ("robot.toml", "max_opening_m = 0.085", "max_opening_m = 85.0", "write 0.085 if"),
         ("robot.toml", "max_opening_m = 0.085", "max_opening_m = 8.5", "0.085 if 8.5 is in cent"),
         ("robot.toml", "radius_m = 0.05715", "radius_m = 0.070", "mm of the law"),
+        ("robot.toml", "radius_m = 0.05715", "radius_m = 57.15", "0.05715 if 57.15 is in mil"),
+        ("robot.toml", "friction = 0.7", "friction = -1", "friction is -1; 0.01 to 10 is acc"),
         ("robot.toml", "usual_n = 70.0", "usual_n = 7.0", "least of 20 N"),
         ("robot.toml", "distance_m = 0.155046", "distance_m = 0.1", "into the arm"),
         ("robot.toml", "distance_m = 0.155046", "distance_m = 155.046", "no hand in metres"),

@@ -74,6 +74,8 @@ def until_still(
         sleep(config.interval_s)
 
 
+LONGEST_SETTLE_S = 60.0
+"""A longer wait after every move was given in milliseconds [s]."""
 BoardCheck = Callable[[UInt8], str]
 """Returns what is wrong with a colour image (H, W, 3) of the board, or an empty text."""
 Seen = Callable[[str, tuple[Check, ...]], None]
@@ -116,8 +118,10 @@ class CaptureConfig:
                 f"the speed is {self.speed_scale:g} of the plan's; more than 0 and at most 1 is "
                 "accepted: the plan's moves were timed at its own speed."
             )
-        if self.settle_s < 0:
-            raise InputError(f"the settle time is {self.settle_s:g} s; 0 or more is needed.")
+        if not 0 <= self.settle_s <= LONGEST_SETTLE_S:
+            raise InputError(
+                f"the settle time is {self.settle_s:g} s; 0 to {LONGEST_SETTLE_S:g} s is accepted."
+            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

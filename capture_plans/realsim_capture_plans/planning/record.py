@@ -113,6 +113,8 @@ class PlanConfig:
                 f"PlanConfig: radii {self.radius_m} and distances {self.board_distance_m} are in "
                 "metres, farther than arms reach. Were millimetres given?"
             )
+        if min(*self.keep_out_m, *self.board_keep_out_m) < 0:
+            raise InputError("keep-out: the box of the objects has sizes of 0 or more [m].")
         if min(self.speed, self.acceleration, self.clearance_m, self.edge_step_rad) <= 0:
             raise InputError("PlanConfig: speed, acceleration, clearance, step must be positive.")
 

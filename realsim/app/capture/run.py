@@ -108,9 +108,9 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
             if request.dry_run:
                 return _rehearse(request, plan, (arm, camera), (config, target), console)
             assert camera is not None  # only a rehearsal does without
+            named = open_fixed(request.fixed_cameras, request.simulated, stack)
             store = _session(request, plan, (arm, camera), target)
             stack.enter_context(only_run_in(store.folder))
-            named = open_fixed(request.fixed_cameras, request.simulated, stack)
             fixed = fixed_stores(store, named)
             work = (config, store, target, lab, fixed)
             return _carry_out(request, plan, (arm, camera), work, console)
@@ -359,9 +359,15 @@ def _check_same_lab(request: CaptureRequest, store: SessionStore) -> None:
     lab = {"seed": request.seed, "objects": request.objects} if request.simulated else None
     if (then := store.extra.get("lab", lab)) != lab:
         raise InputError(
-            f"'{store.folder}' was begun in the simulated lab {then}, not in {lab}: give the same "
+            f"'{store.folder}' was begun {_in_lab(then)}, not {_in_lab(lab)}: give the same "
             "--seed and --objects, or a new folder."
         )
+
+
+def _in_lab(lab: dict[str, int] | None) -> str:
+    if lab is None:
+        return "with devices"
+    return "in the simulated lab with " + ", ".join(f"--{k} {v}" for k, v in lab.items())
 
 
 def _keep_board(out: Path, target: Target | None) -> None:

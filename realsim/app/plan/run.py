@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from realsim.errors import InputError
 from realsim.robots.arm import find_arm, known_chains
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
+from realsim.store.atomic import only_run_in
 from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import JointUnit
 from realsim_capture_plans.planning.advise import better_place
@@ -75,9 +77,19 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
             f"from here: the views leave one side out. {better_place(chain, mount, config, above)}"
         )
     files: list[Path] = []
-    if not request.no_pictures:
-        files = _write_pictures(plan, plan.metrics, picture_folder(out), console)
-    save_plan(plan, out)  # last: what was interrupted before can be run again
+    with ExitStack() as stack:
+        if not request.no_pictures:
+            picture_folder(out).mkdir(exist_ok=True)
+            stack.enter_context(only_run_in(picture_folder(out)))
+        _check_free_name(out, request.overwrite)  # another run may have made it meanwhile
+        if not request.no_pictures:
+            files = _write_pictures(plan, plan.metrics, picture_folder(out), console)
+        try:
+            # Last: what was interrupted before can be run again. Of two runs one makes the file.
+            out.touch(exist_ok=request.overwrite)
+        except FileExistsError:
+            _check_free_name(out, overwrite=False)
+        save_plan(plan, out)
     console.say(f"plan: {out}")
     console.result(_document(plan, plan.metrics) | {"plan": out, "pictures": files})
     return free
