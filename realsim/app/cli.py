@@ -75,15 +75,17 @@ QUIET_KEY = "realsim.quiet"
     "realsim", cls=Realsim, late=COMMANDS,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )  # fmt: skip
-@click.option("--config", "config_file", type=click.Path(path_type=Path), default=None)
+@click.option("--config", "config_file", type=click.Path(path_type=Path), multiple=True)
 @click.option(NO_COLOUR, is_flag=True)
 @click.version_option(__version__, prog_name="realsim")
 @click.pass_context
-def commands(ctx: click.Context, config_file: Path | None, no_color: bool) -> None:
+def commands(ctx: click.Context, config_file: tuple[Path, ...], no_color: bool) -> None:
     """Turn robot captures into grasping data that you can trust."""
     from realsim.app.config.settings import apply_config
 
-    apply_config(ctx, config_file, quiet=bool(ctx.meta.get(QUIET_KEY)))
+    if len(config_file) > 1:
+        raise click.UsageError(f"--config names {len(config_file)} files; one is read. Give one.")
+    apply_config(ctx, next(iter(config_file), None), quiet=bool(ctx.meta.get(QUIET_KEY)))
 
 
 class Terminated(KeyboardInterrupt):

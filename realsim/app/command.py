@@ -48,10 +48,13 @@ class Command(Exemplified):
                 say_renamed(f"--{old}", f"--{renamed[old]}")
         try:
             return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name == "--config":
+                told = f"{error.message} It goes before the command: realsim --config FILE COMMAND."
+                raise click.UsageError(told, ctx) from error
+            raise
         except click.BadParameter as error:
-            for kind, word in (("integer range", "whole number"), ("float range", "number")):
-                told = error.message.replace(f"a valid {kind}", f"a {word}")
-                error.message = told  # pyright: ignore[reportAttributeAccessIssue]
+            error.message = in_words(error)  # pyright: ignore[reportAttributeAccessIssue]
             option = error.param
             if not isinstance(option, click.Option):
                 raise
@@ -59,6 +62,12 @@ class Command(Exemplified):
                 raise
             told = f"{error.message} The variable {option.envvar} says so."
             raise click.BadParameter(told, ctx=ctx, param=option) from error
+
+
+def in_words(error: click.BadParameter) -> str:
+    """Return what click says of a value, with plain names of what is accepted."""
+    told = error.message.replace("a valid integer range", "a whole number")
+    return told.replace("a valid float range", "a number")
 
 
 class Group(Exemplified, click.Group):

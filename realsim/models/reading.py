@@ -29,8 +29,11 @@ from realsim.records import Mesh
 from realsim.store.provenance import sha256_of
 
 SCAN_FORMATS = (*TRIMESH_FORMATS, *USD_FORMATS)
-SMALLEST_M, LARGEST_M = 0.004, 3.0
-"""Largest extents outside of this are no object on a table: the unit is wrong [m]."""
+SMALLEST_M, LARGEST_M = 0.004, 1.7
+"""Largest extents outside of this are no object on a table: the unit is wrong [m]. A library's
+files take diameters up to 3 m, which a cube of 1.73 m has."""
+USUAL_M = 0.8
+"""A larger object is seldom grasped: its size is told in all units [m]."""
 ROTATIONS: dict[UpAxis, tuple[tuple[int, int, int], ...]] = {
     "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
@@ -199,6 +202,8 @@ def _scale(
             f"{_length(LARGEST_M)} is accepted; {_readings(extent)}. Give the unit that makes "
             "sense; a generated mesh has no scale: --unit none."
         )
+    if size > USUAL_M:
+        notes.append(f"in {chosen} it is {_length(size)} large. Is that so? {_readings(extent)}.")
     return chosen, METRES[chosen]
 
 

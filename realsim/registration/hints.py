@@ -66,7 +66,7 @@ TYPED = re.compile(
     rf"(?:,(?P<w>{NUMBER})x(?P<h>{NUMBER}))?)?"
 )
 GRAMMAR = (
-    "accepted are 5 (or a name) = anywhere, 5x2 = two of them, 5@view3:640,360 = seen at that "
+    "Accepted are 5 (or a name) = anywhere, 5x2 = two of them, 5@view3:640,360 = seen at that "
     "pixel, 5@view3:100,80,60x40 = seen in that box (left, top, width x height)"
 )
 
@@ -79,7 +79,7 @@ def parse_object(text: str, models: Mapping[int, ObjectModel]) -> list[Hint]:
     """
     match = TYPED.fullmatch(text.strip())
     if match is None:
-        raise InputError(f"'{text}' does not name an object: {GRAMMAR}.")
+        raise InputError(f"'{text}' does not name an object. {GRAMMAR}.")
     said = match["object"].strip()
     obj_id, count = _object_of(said, models), 1
     counted = re.fullmatch(r"(.+)x(\d+)", said)
@@ -87,9 +87,7 @@ def parse_object(text: str, models: Mapping[int, ObjectModel]) -> list[Hint]:
         obj_id, count = _object_of(counted[1], models), int(counted[2])
     if obj_id is None:
         known = ", ".join(f"{k} ({m.name})" for k, m in sorted(models.items()))
-        raise InputError(
-            f"'{text}': there is no object '{said}'; there are: {known or 'none'}. {GRAMMAR}."
-        )
+        raise InputError(f"there is no object '{said}'; there are: {known or 'none'}. {GRAMMAR}.")
     where: Where = None
     if match["view"] is not None:
         x, y, view = float(match["x"]), float(match["y"]), int(match["view"])

@@ -289,7 +289,7 @@ class _Reader:
                 return found
         raise InputError(
             f"{where} names the mesh '{named[:200]}', which is not there. Looked for: "
-            f"{', '.join(str(t) for t in tries)}. Put it there, or correct the URDF."
+            f"{', '.join(str(t) for t in dict.fromkeys(tries))}. Put it there, or correct the URDF."
         )
 
     def _mass(self, link: str) -> float:
@@ -338,5 +338,10 @@ def _limits(joint: Element, where: str) -> Array:
         raise InputError(
             f"{where} has the limits {values[0]:g} to {values[1]:g} rad. Are these degrees? A URDF "
             f"holds radians: {np.radians(values[0]):.4f} to {np.radians(values[1]):.4f}."
+        )
+    elif values[0] >= values[1]:
+        raise InputError(
+            f"{where} has the limits lower={values[0]:g} and upper={values[1]:g}; lower must be "
+            "below upper. Are they swapped?"
         )
     return np.array(values)

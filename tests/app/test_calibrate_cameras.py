@@ -288,8 +288,9 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
         own.add_view(View(index=k), load_image(photos / "left/000.png"), depth)
     write_json(tmp_path / "session/calibration/board.json", target_to_json(TABLE))
     held = str(photos.parent / "held.json")
-    cameras = ("--cameras", "wrist=hand,left=fixed,right=fixed")
-    result = invoked("calibrate", tmp_path / "session", *cameras, "--held-board", held)
+    words = ("calibrate", tmp_path / "session", "--held-board", held, "--cameras")
+    assert "'up': neither the session" in str(invoked(*words, "wrist=hand,up=fixed").exception)
+    result = invoked(*words, "wrist=hand,left=fixed,right=fixed")
     assert result.exit_code in {0, 1}, result.output
     found = read_cameras(tmp_path / "session/calibration/cameras/cameras.json")
     off = se3.invert(FIXED["left"]) @ found.camera("left").T

@@ -169,6 +169,9 @@ def test_the_first_file_that_is_there_is_read(monkeypatch: pytest.MonkeyPatch) -
     assert views() == 3
     written("[register]\nviews = 4\n", "named.toml")
     assert views("--config", "named.toml") == 4
+    assert "Give one" in complained(*["--config", "named.toml"] * 2, "config", "show")
+    assert "before the command" in complained("register", "s", "--config", "named.toml")
+    assert read("[plan]\ncenter = [0.4, 0, 0.05]")["plan"]["center"] == "0.4,0,0.05"
     monkeypatch.setenv("REALSIM_CONFIG", "")
     assert views() == "all"
     assert find_config(None) is None
@@ -197,10 +200,11 @@ def test_a_named_file_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPa
 
 REFUSED = {
     "[registre]\nviews = 3": ["settings.toml, line 1", "[registre]", "did you mean register"],
-    "\n[register]\nmethod = 'joint'\nview = 3": [
-        "settings.toml, line 4", "no option 'view'", "did you mean views", "depth-bias",
+    "\n[register]\nmethod = 'joint'\nVIEW = 3": [
+        "settings.toml, line 4", "no option 'VIEW'", "did you mean views", "depth-bias",
     ],
     "[register]\nmethod = 'both'": ["line 2", '"both"', "joint", "top-down"],
+    "[register]\nviews = 2.5": ["line 2", "is not a whole number"],
     "[demo]\nviews = 2": ["line 2", "2", "4<=x<=1024"],
     "[demo]\nviews = true": ["line 2", "true", "a whole number"],
     "[demo]\nquiet = 'yes'": ["line 2", "true or false"],

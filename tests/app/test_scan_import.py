@@ -96,6 +96,7 @@ def test_a_mesh_is_imported_listed_shown_and_checked(imported, tmp_path: Path):
 
 def test_a_mesh_without_scale_waits_for_one(meshes: Path, tmp_path: Path):
     library = tmp_path / "m"
+    assert "Is that so?" in scan_import(meshes, tmp_path / "c", "box.ply", "--unit", "cm")[1]
     code, out, _ = scan_import(meshes, library, "wedge.ply", "--unit", "none")
     assert code == 0 and "realsim scan scale wedge SESSION" in out
     assert json.loads((library / "models_info.json").read_text()) == {}
@@ -130,7 +131,7 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(meshes: Path, tmp
     ("words", "said"),
     [
         (["wedge.ply"], "does not state its unit"),
-        (["wedge.ply", "--unit", "m"], "as mm"),
+        (["box.ply", "--unit", "inch"], "4 mm to 1.7 m is accepted"),
         (["broken.obj", "--unit", "mm"], "mesh: it seems to be cut off or damaged. Copy"),
         (["points.ply", "--unit", "mm"], "no triangles"),
         (["flat.ply", "--unit", "mm"], "flat"),

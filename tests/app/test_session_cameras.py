@@ -186,6 +186,7 @@ def test_cameras_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     result = run_register(store, QUIET, RegisterRequest())
     words = [r.words for r in result.remarks if "'left'" in r.words]
     assert len(words) == 1 and "--cameras wrist=hand,left=fixed" in words[0]
+    assert "plan --board-views" in refused("calibrate", store.folder)
     moving = open_cameras(store)["left"]
     Ts = {k: T_TRUE @ se3.from_translation([0.001 * k, 0, 0]) for k in range(IMAGES)}
     moving.set_cameras(moving.session.intrinsics, Ts)

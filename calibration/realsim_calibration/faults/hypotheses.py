@@ -162,6 +162,7 @@ def inverted(p: Poses) -> Hypothesis:
         )
     mode = "eye_to_hand" if p.eye_in_hand else "eye_in_hand"
     flag = "give --eye-to-hand" if p.eye_in_hand else "leave --eye-to-hand out"
+    flag += f" (or, among --cameras, say NAME={'fixed' if p.eye_in_hand else 'hand'})"
     remedy = (
         "add ',inverted' to the reading that was told or given, as in --reading matrix,m,inverted "
         "where it is matrix,m (Python: give T_base_ee)"

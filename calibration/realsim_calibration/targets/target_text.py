@@ -195,8 +195,7 @@ def parse_target(text: str) -> Target:
         )
     if form is None or not colon:
         raise InputError(
-            f"'{kind}' in '{text}' is no kind of target. Accepted are lines like:\n"
-            + target_usage()
+            f"`{text}` is no kind of target. Accepted are lines like:\n" + target_usage()
         )
     target = cast(Target, form.record(**_fields(text, rest, form)))
     check_markers(target)

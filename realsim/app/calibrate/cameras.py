@@ -29,7 +29,7 @@ from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError, RealsimError
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes, write_text
-from realsim.store.cameras import camera_folders, open_cameras
+from realsim.store.cameras import camera_folder, camera_folders, open_cameras
 from realsim_calibration import (
     DepthBoardView,
     calibrate_intrinsics,
@@ -113,6 +113,12 @@ def _run_session(
         place = store.folder / ("rgb" if camera.mount == "hand" else f"rgb_{camera.name}")
         if camera.mount == "fixed" and camera.name in inner:
             place = inner[camera.name].folder / "rgb"
+        elif not place.is_dir():
+            own = camera_folder(store.folder, camera.name)
+            raise InputError(
+                f"there are no images of the camera '{camera.name}': neither the session {own} "
+                f"(`realsim capture --fixed-cameras` makes it) nor the folder {place} is there."
+            )
         found = {p.stem: p for p in list_images(place).images}
         images[camera.name] = {
             i: found[f"{v.index:06d}"] for i, v in enumerate(views) if f"{v.index:06d}" in found

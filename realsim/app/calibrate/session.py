@@ -1,5 +1,6 @@
 """The hand-eye of a session, also of one with board views only: before the board is taken away."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,8 +39,10 @@ def calibrate_session(
     folder = store.folder / BOARD_VIEWS
     if not (folder / "session.json").is_file():
         raise InputError(
-            f"session '{store.folder}' has no board views: {folder} is missing. Capture the tag "
-            "board first, or place the cameras by importing a calibration."
+            f"session '{store.folder}' has no board views: {folder} is missing. Capture them first "
+            "(`realsim plan --board-views --out board_plan.json`, then `realsim capture "
+            f"{shlex.quote(str(store.folder))} --plan board_plan.json --board TARGET ...`), or "
+            "place the cameras by importing a calibration."
         )
     views_store = SessionStore.open(folder)
     require_sound(views_store)

@@ -178,8 +178,8 @@ def _of_command(
         where = f"{file.place(path, key)}: [{'.'.join(path)}]"
         if option is None:
             raise InputError(
-                f"{where} has no option '{key}'{_perhaps(name, list(options))}. Its options are: "
-                f"{', '.join(options)}."
+                f"{where} has no option '{key}'{_perhaps(name.lower(), list(options))}. Its "
+                f"options are: {', '.join(options)}."
             )
         assert option.name is not None
         if option.name in found:
@@ -203,6 +203,8 @@ def _value(option: click.Option, value: Any, where: str) -> Any:
                 f"{where} = {_shown(value)} cannot be used; a list of {option.nargs} is accepted."
             )
         return [_one(option, each, where) for each in several]
+    if isinstance(value, list) and kind_of(option) == "a text in quotes":
+        value = ",".join(map(str, cast("list[Any]", value)))
     return _one(option, value, where)
 
 
@@ -228,7 +230,8 @@ def _one(option: click.Option, value: Any, where: str) -> Any:
     try:
         option.type.convert(text, option, ctx)
     except click.BadParameter as error:
-        raise InputError(f"{where} = {_shown(value)} cannot be used: {error.message}") from error
+        told = command_line.in_words(error)
+        raise InputError(f"{where} = {_shown(value)} cannot be used: {told}") from error
     return text
 
 

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from realsim.app.console import Console
@@ -219,7 +220,9 @@ def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) 
         )
     console.say(f"page      {campaign.out / PAGE}")
     if result.failed:
-        console.say(f"next      realsim pipeline {campaign.file}   (what failed is tried again)")
+        console.say(
+            f"next      realsim pipeline {quote(str(campaign.file))}   (what failed is tried again)"
+        )
 
 
 def _own_folder(campaign: Campaign) -> Path:

@@ -153,7 +153,9 @@ class PlanRequest:
         changes: dict[str, Any] = {}
         if self.radius:
             name = "board_distance_m" if self.board else "radius_m"
-            changes[name] = tuple(numbers(self.radius, 2, "--radius", "least,greatest [m]"))
+            changes[name] = tuple(
+                numbers(self.radius.replace("-", ","), 2, "--radius", "least-greatest [m]")
+            )
         if self.elevation:
             if self.board:
                 raise InputError("--elevation is for views of a scene; a board's follow its tilt.")

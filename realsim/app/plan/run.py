@@ -352,8 +352,8 @@ def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) ->
             )
         )
         if goal.met is False:
-            missed.append(f"{meaning.text}: {value:.4g} {meaning.unit}, good is {goal.text}")
-    console.table("How good it is", ("metric", "value", "good", ""), rows)
+            missed.append(f"{meaning.text}: {rows[-1][1]}, good is {goal.text}")
+    console.table("How good it is", ("metric", "value", "good", "met"), rows)
     console.warn(*missed)
     if plan.mount.T_ee_cam[2, 2] < LOOKING_BACK:
         console.warn(

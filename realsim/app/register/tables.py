@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -217,9 +218,10 @@ def next_line(folder: Path, result: Registered) -> str:
             "next      look at the reasons above and at registration/register.html; a click helps "
             "most: --object ID@view3:640,360"
         )
+    at = quote(str(folder))
     if result.not_placed or any(o.verdict != "accepted" for o in result.scene.objects):
-        return f"next      realsim review {folder}   (a person decides on what is not accepted)"
-    return f"next      realsim school {folder}   (or `realsim review` to look at it)"
+        return f"next      realsim review {at}   (a person decides on what is not accepted)"
+    return f"next      realsim school {at}   (or `realsim review` to look at it)"
 
 
 def show_registered(

@@ -9,6 +9,7 @@ import webbrowser
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from realsim import local_pages
@@ -71,7 +72,7 @@ def run_review(request: ReviewRequest, console: Console) -> None:
     if changed:
         console.say("decisions count in every later command; to fit the other poses to them, too:")
     for folder in changed:
-        console.say(f"next      realsim register {folder} --from-review")
+        console.say(f"next      realsim register {quote(folder)} --from-review")
     console.result(
         {
             "sessions": [str(s.folder) for s in stores],

@@ -108,8 +108,8 @@ def load_models(
         found = "has no models" if folder.is_dir() else "does not exist"
         raise InputError(
             f"{folder} {found}; files obj_000001.ply, obj_000002.ply, ... are expected, as "
-            "in the folder 'models' of a BOP dataset. Of a data set whose models lie elsewhere, "
-            "give them with --models FOLDER (to `realsim import`, run again, of a session)."
+            "in the folder 'models' of a BOP dataset. If the models lie elsewhere, name their "
+            "folder by --models FOLDER (for a session: run `realsim import` again with it)."
         )
     if not (folder / INFO_FILE).is_file():
         raise InputError(

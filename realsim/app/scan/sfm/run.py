@@ -7,6 +7,7 @@ What `realsim scan sfm` works on: a session, or a folder of photographs, with ma
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,7 +184,7 @@ def mesh_from_depth(
     _write_dense(fused, out)
     _show_dense(fused, console)
     console.say(f"mesh      {out / MESH} (metres)")
-    console.say(f"next      realsim scan import {out / MESH} --unit m --name NAME")
+    console.say(f"next      realsim scan import {quote(str(out / MESH))} --unit m --name NAME")
     return fused.verdict == "accepted"
 
 
