@@ -339,7 +339,7 @@ def _limits(joint: Element, where: str) -> Array:
             f"{where} has the limits {values[0]:g} to {values[1]:g} rad. Are these degrees? A URDF "
             f"holds radians: {np.radians(values[0]):.4f} to {np.radians(values[1]):.4f}."
         )
-    elif values[0] >= values[1]:
+    elif values[0] > values[1]:
         raise InputError(
             f"{where} has the limits lower={values[0]:g} and upper={values[1]:g}; lower must be "
             "below upper. Are they swapped?"

@@ -84,12 +84,7 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
         _check_free_name(out, request.overwrite)  # another run may have made it meanwhile
         if not request.no_pictures:
             files = _write_pictures(plan, plan.metrics, picture_folder(out), console)
-        try:
-            # Last: what was interrupted before can be run again. Of two runs one makes the file.
-            out.touch(exist_ok=request.overwrite)
-        except FileExistsError:
-            _check_free_name(out, overwrite=False)
-        save_plan(plan, out)
+        save_plan(plan, out)  # last: what was interrupted before can be run again
     console.say(f"plan: {out}")
     console.result(_document(plan, plan.metrics) | {"plan": out, "pictures": files})
     return free
