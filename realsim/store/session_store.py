@@ -401,7 +401,7 @@ class SessionStore:
     def remove(self, relative: str) -> None:
         """Take a file away and off the manifest; one that is not there is no error."""
         self.path(relative)  # refuses a path that leads out of the session
-        with storing(self.folder, f"that {relative} is gone"):
+        with storing(self.folder, f"the removal of {relative}"):
             self._manifest.remove(PurePosixPath(relative).as_posix())
         self._session = None
 

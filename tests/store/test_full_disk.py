@@ -125,6 +125,7 @@ def test_a_line_that_does_not_fit_leaves_no_half_line(
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 50, hard))
     refused("File too large", add, store, 100, error=StorageError)
+    refused("the removal of rgb/0", store.remove, "rgb/000000.png", error=StorageError)
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     assert path.read_bytes() == before
     assert (100 in store.completed) == (name == "manifest.jsonl")
