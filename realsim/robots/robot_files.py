@@ -215,6 +215,8 @@ def _said(file: Path, key: str) -> Any:
 
 
 def _plain(name: str) -> str:
+    if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InputError(f"a robot is called {name!r}; its name, or its folder as text, is needed.")
     return name.casefold().replace("-", "_").replace(" ", "_")
 
 

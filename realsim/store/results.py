@@ -79,12 +79,14 @@ def save_scene(store: SessionStore, scene: Scene) -> None:
     store.write_json(SCENE_FILE, to_json(scene))
 
 
-def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
-    """Return the registered scene of the session.
+def load_scene(store: SessionStore | Path | str, name: str = SCENE_FILE) -> Scene:
+    """Return the registered scene of a session, or of its folder.
 
     Raises:
-        InputError: the file is damaged, or is not the one that was written.
+        InputError: there is no session, the file is damaged, or is not the one that was written.
     """
+    if not isinstance(store, SessionStore):
+        store = SessionStore.open(store)
     scene = read_own(store.path(name), Scene)
     if not store.is_as_written(name):
         raise InputError(
@@ -200,9 +202,11 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
     """Return all complete grasp sets of a session or of a folder, by instance number.
 
     Raises:
-        InputError: a file is broken, or of a newer format.
+        InputError: the folder is not there, or a file is broken, or of a newer format.
     """
-    return [_load_grasp_set(file) for file in sorted(grasp_folder(folder).glob("*_obj*.npz"))]
+    if not (where := grasp_folder(folder)).is_dir():
+        raise InputError(f"'{where}' is not a folder; give a session, or a folder of grasp files.")
+    return [_load_grasp_set(file) for file in sorted(where.glob("*_obj*.npz"))]
 
 
 def grasps_on(scene: Scene, sets: Iterable[GraspSet]) -> list[GraspSet]:

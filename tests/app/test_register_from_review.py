@@ -65,7 +65,7 @@ def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -
     assert f"instance {second.instance}" in words and "rejected by ada: it is gone" in words
     assert f"instance {first.instance}" in words and "starts from where it was put" in words
     # The depth pulls what a person moved back to where it stands.
-    now = load_scene(session).object(first.instance)
+    now = load_scene(str(session.folder)).object(first.instance)
     assert 1e3 * np.linalg.norm(now.T_world_obj[:3, 3] - first.T_world_obj[:3, 3]) < 0.5
     # Nothing is lost: the earlier scene, the journal, and what was taken in.
     assert session.path("registration/earlier/scene_001.json").read_bytes() == data

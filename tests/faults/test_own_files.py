@@ -113,6 +113,7 @@ def test_what_a_grasp_set_claims_is_there(array: str, session: Path) -> None:
     file = save_grasps(SessionStore.open(session), grasp_set(1, 0, 3))
     with_claim(file, array, (10**11, 4, 4))
     assert str(file) in refusals.refused("100000000000x4x4", load_grasps, session)
+    refusals.refused("nix' is not a folder", load_grasps, session / "nix")
     refused("stats", session)
 
 

@@ -217,6 +217,7 @@ def test_a_description_that_can_be_read_and_is_wrong_is_told(tmp_path: Path) -> 
 
 def test_a_folder_that_is_no_robot_is_told(tmp_path: Path) -> None:
     refused(r"has no robot\.toml", find_arm, str(tmp_path) + "/")
+    refused("called None", find_arm, None)
     refused(r"no arm 'ur55'\. There are: .*ur5,", find_arm, "ur55")
 
 

@@ -74,7 +74,7 @@ def annotate_session(
     damaged = require_sound(store)
     scene = judged_scene(store)
     models = session_models(store, console)
-    sets = load_grasps(store.folder / "grasps")
+    sets = load_grasps(store)
     grasps = grasps_of_scene(store, scene, sets, console)
     cameras = {name: c for name, c in open_cameras(store).items() if _is_placed(c)}
     wrong = {name: require_sound(camera) for name, camera in cameras.items()}

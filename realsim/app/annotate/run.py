@@ -77,7 +77,7 @@ def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) ->
 
     views, scene = registered_views(store), judged_scene(store)
     there = {(o.instance, o.obj_id) for o in scene.objects}
-    sets = load_grasps(store.folder / "grasps")
+    sets = load_grasps(store)
     chosen = sheet_views(views, summary.flagged_views, PAGE_PICTURES)
     pictures: list[Image] = []
     drawn = overlay_pictures(

@@ -162,7 +162,7 @@ def _photographs(section: Section, store: SessionStore) -> None:
     if not indices or not store.has("registration/scene.json"):
         return
     scene, models = load_scene(store), session_models(store)
-    grasps = load_grasps(store.folder / "grasps")
+    grasps = load_grasps(store)
     shown = evenly(registered_views(store) or indices, OVERLAY_VIEWS)
     folder = store.folder / "reports"
     is_kept = section.pictures == "kept"
