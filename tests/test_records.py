@@ -43,6 +43,12 @@ def test_records_can_be_compared_and_hashed_as_things():
     ("make", "says"),
     [
         (lambda: CameraIntrinsics(width=0, height=1, fx=1, fy=1, cx=0, cy=0), "image size"),
+        (lambda: dataclasses.replace(CAMERA, width=1280.5), "size is 1280.5x48; whole numbers"),
+        (lambda: dataclasses.replace(CAMERA, distortion=np.ones((2, 3))), r"shape \(2, 3\)"),
+        (lambda: dataclasses.replace(CAMERA, distortion="plumb_bob"), "'plumb_bob'; numbers are"),
+        (lambda: View(index="0"), "view is '0'; a whole number"),
+        (lambda: View(index=0, joints="home"), "joints is 'home'; numbers are"),
+        (lambda: ObjectPose(obj_id=5, instance=0, T_world_obj=np.eye(4), verdict="good"), "'good'"),
         (lambda: CameraIntrinsics(width=1, height=1, fx=-1, fy=1, cx=0, cy=0), "focal length fx"),
         (lambda: dataclasses.replace(CAMERA, distortion=np.ones(12)), "12 distortion coefficients"),
         (

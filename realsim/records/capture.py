@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.records.checked_arrays import freeze, frozen, numbered, rigid
+from realsim.records.checked_arrays import freeze, frozen, numbered, numbers, rigid, whole
 
 DISTORTION_TERMS = 8
 """OpenCV order k1 k2 p1 p2 k3 k4 k5 k6; the Brown model leaves k4 k5 k6 at zero."""
@@ -39,10 +39,10 @@ class CameraIntrinsics:
 
     def __post_init__(self) -> None:
         """Check ranges and freeze the distortion."""
-        if not (0 < self.width <= LONGEST_SIDE and 0 < self.height <= LONGEST_SIDE):
+        if not (whole(self.width, 1, LONGEST_SIDE) and whole(self.height, 1, LONGEST_SIDE)):
             raise InputError(
-                f"the image size is {self.width}x{self.height}; 1 to {LONGEST_SIDE} pixels a side "
-                "are accepted."
+                f"the image size is {self.width!r}x{self.height!r}; whole numbers of 1 to "
+                f"{LONGEST_SIDE} pixels a side are accepted."
             )
         for name in ("fx", "fy"):
             f = getattr(self, name)
@@ -50,7 +50,10 @@ class CameraIntrinsics:
                 raise InputError(f"the focal length {name} is {f}; it must be positive pixels.")
         if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
             raise InputError(f"the principal point ({self.cx}, {self.cy}) is not finite.")
-        d = np.asarray(self.distortion, dtype=np.float64).ravel()
+        d = np.squeeze(numbers(self.distortion, np.float64, "the distortion"))
+        if d.ndim > 1:
+            raise InputError(f"the distortion has shape {d.shape}; one row of numbers is expected.")
+        d = d.ravel()
         if not np.all(np.isfinite(d)):
             raise InputError(f"the distortion {d.tolist()} is not of finite numbers.")
         if len(d) > DISTORTION_TERMS and np.any(d[DISTORTION_TERMS:] != 0):

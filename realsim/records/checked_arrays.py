@@ -20,7 +20,7 @@ MOST_ID = 999_999_999
 
 def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
     """Return a read-only copy of `value`, its shape checked (None = any length)."""
-    array = np.array(value, dtype=dtype)
+    array = numbers(value, dtype, name)
     if array.ndim != len(shape) or any(
         n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
     ):
@@ -28,6 +28,18 @@ def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: st
         raise InputError(f"{name} has shape {array.shape}; the shape must be {wanted}.")
     array.setflags(write=False)
     return array
+
+
+def numbers(value: ArrayLike, dtype: Any, name: str) -> NDArray[Any]:
+    """Return a copy as an array of numbers.
+
+    Raises:
+        InputError: it holds something else.
+    """
+    try:
+        return np.array(value, dtype=dtype)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} is {value!r:.80}; numbers are expected.") from None
 
 
 def freeze(record: Any, dtype: Any = np.float64, /, **shapes: tuple[int | None, ...]) -> None:
@@ -50,14 +62,21 @@ def rigid(value: ArrayLike, name: str) -> Array:
     return frozen(T, np.float64, (4, 4), name)
 
 
+def whole(value: Any, low: int, high: int) -> bool:
+    """Return whether it is a whole number in a range."""
+    return isinstance(value, int | np.integer) and low <= int(value) <= high
+
+
 def numbered(value: int, name: str, low: int = 0) -> None:
     """Check that a number names something: a view, an object, an instance.
 
     Raises:
-        InputError: it is not between `low` and a billion.
+        InputError: it is no whole number between `low` and a billion.
     """
-    if not low <= value <= MOST_ID:
-        raise InputError(f"{name} is {value}; a number from {low} to {MOST_ID} is expected.")
+    if not whole(value, low, MOST_ID):
+        raise InputError(
+            f"{name} is {value!r}; a whole number from {low} to {MOST_ID} is expected."
+        )
 
 
 def rows_of(record: Record, rows: NDArray[Any] | slice) -> Record:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -103,6 +103,8 @@ class ObjectPose:
         """Check that the pose is rigid and freeze the arrays."""
         numbered(self.obj_id, "obj_id")
         numbered(self.instance, f"the instance of object {self.obj_id}")
+        if self.verdict not in (known := get_args(Verdict)):
+            raise InputError(f"the verdict is {self.verdict!r}; {', '.join(known)} are accepted.")
         name = f"T_world_obj of object {self.obj_id} (instance {self.instance})"
         object.__setattr__(self, "T_world_obj", rigid(self.T_world_obj, name))
         freeze(self, covariance=(6, 6))
