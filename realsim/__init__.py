@@ -75,3 +75,8 @@ def __getattr__(name: str) -> Any:
     if name.islower() or name == "Result":
         where = "realsim.app.verbs"
     return getattr(import_module(where), name)
+
+
+def __dir__() -> list[str]:
+    """Return the promised names, loaded or not, for tab completion."""
+    return [*__all__, "__version__"]

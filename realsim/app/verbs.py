@@ -6,13 +6,14 @@ argument, by its name with `_` for `-`; None leaves it to the command.
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import click
+import numpy as np
 
 from realsim.app.cli import commands, refusal
 from realsim.app.command import Group, context_of, spelling, typed
@@ -104,7 +105,7 @@ def open(
         told = run("import", (source, out), options, progress)
     elif options:
         raise InputError(f"open: {', '.join(options)} are for an import; give `out`, its session.")
-    store = open_session(Path(source if out is None else out))
+    store = open_session(_path(source if out is None else out))
     views, camera = store.session.views, store.session.intrinsics
     done = sorted(path.stem for path in store.path("stages").glob("*.json"))
     rows = [["views", f"{len(views)}, {camera.width} x {camera.height} px"],
@@ -131,9 +132,10 @@ def plan(
     """Plan the views of a scene, or of a board; write the plan and its pictures beside it."""
     from realsim_capture_plans import load_plan
 
+    out = _path(out)  # None, too, is refused before the work
     options |= {"out": out, "views": views, "arm": arm, "board_views": board_views}
     told = run("plan", (), options, progress)
-    return _made("plan", Path(out), load_plan(Path(out)), told, *told.document["pictures"])
+    return _made("plan", out, load_plan(out), told, *told.document["pictures"])
 
 
 def calibrate(
@@ -146,9 +148,9 @@ def calibrate(
     """
     options |= {"board": board, "poses": poses, "out": out}
     told = run("calibrate", (source,), options, progress)
-    if (file := Path(source) / HAND_EYE_FILE).is_file():
+    if (file := _path(source) / HAND_EYE_FILE).is_file():
         value = read_own(file, HandEye)
-        return _made("calibrate", Path(source), value, told, "calibration/report/*.png")
+        return _made("calibrate", _path(source), value, told, "calibration/report/*.png")
     files = [Path(path) for path in told.document["files"]]
     pictures = [path for path in files if path.suffix == ".png"]
     return _made("calibrate", files[0].parent, None, told, *pictures)
@@ -163,8 +165,8 @@ def register(
     options |= {"object": object, "find_all": find_all, "from_review": from_review,
                 "library": library, "views": views}  # fmt: skip
     told = run("register", (session,), options, progress)
-    scene = judged_scene(open_session(Path(session)))
-    return _made("register", Path(session), scene, told, "registration/pictures/*")
+    scene = judged_scene(open_session(_path(session)))
+    return _made("register", _path(session), scene, told, "registration/pictures/*")
 
 
 def scan(
@@ -185,7 +187,7 @@ def scan(
     else:
         told = run("scan scale", (*meshes, session), options, progress)
         names = [options.get("name") or Path(mesh).stem for mesh in meshes]
-    folder, models = Path(library or "models"), list[ObjectModel]()
+    folder, models = _path(library or "models"), list[ObjectModel]()
     if folder.is_dir():
         reader = LibraryReader.open(folder)
         there = [e.obj_id for e in reader.entries() if e.name in names and e.obj_id is not None]
@@ -213,7 +215,7 @@ def annotate(
     """Write masks, maps, poses and grasps for every frame; the record is the summary."""
     options |= {"maps": maps, "workers": workers}
     told = run("annotate", (session,), options, progress)
-    return _made("annotate", Path(session), told.document, told, "reports/annotated.png")
+    return _made("annotate", _path(session), told.document, told, "reports/annotated.png")
 
 
 def render(
@@ -229,12 +231,13 @@ def render(
 
 
 def export(
-    *sources: Place, to: str, out: Place, progress: Progress | None = None, **options: Any,
+    *sources: Place, to: str | None = None, out: Place | None = None,
+    progress: Progress | None = None, **options: Any,
 ) -> Result[Path]:  # fmt: skip
     """Write sessions or data sets in another format; the record is the path of the card."""
     options |= {"to": to, "out": out}
     told = run("export", sources, options, progress)
-    return _made("export", Path(out), told.document.card, told)
+    return _made("export", _path(out), told.document.card, told)
 
 
 def review(
@@ -247,7 +250,7 @@ def review(
     """
     options |= {"static": static, "port": port, "reviewer": reviewer}
     told = run("review", sessions, options, progress)
-    store = open_session(Path(told.document["sessions"][0] if static is None else sessions[0]))
+    store = open_session(_path(told.document["sessions"][0] if static is None else sessions[0]))
     return _made("review", store.folder, judged_scene(store), told)
 
 
@@ -268,10 +271,11 @@ def run(
 
     Raises:
         InputError: an option that it has not, or a value that it refuses.
+        RealsimError: the disk is full, a library is missing, or the data do not tell the answer.
     """
     path = name.split()
     told = Told(progress=progress)
-    words = [*path, *_words(name, path, options), *[os.fspath(p) for p in places]]
+    words = [*path, *_words(name, path, options), *map(_typed_path, places)]
     try:
         commands.main(words, prog_name="realsim", standalone_mode=False, obj=told)
     except SystemExit as end:
@@ -291,7 +295,7 @@ def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> Iterat
     """Return options as they are typed.
 
     Raises:
-        InputError: the command has no such option.
+        InputError: the command has no such option, or it is given no path or no bool.
     """
     command: click.Command = commands
     for k, part in enumerate(path):
@@ -307,6 +311,35 @@ def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> Iterat
             continue
         if key not in known:
             raise InputError(f"{name} has no option '{key}'; it has {', '.join(sorted(known))}.")
-        option = known[key]
-        single = option.multiple and isinstance(value, str | os.PathLike)
-        yield from [str(w) for w in typed(option, (value,) if single else value)]
+        option, what = known[key], f"{name}: {key}"
+        if option.is_flag and not isinstance(value, bool | np.bool_):
+            raise InputError(f"{what} is {value!r}; True or False is accepted.")
+        given: Any = value.tolist() if isinstance(value, np.ndarray) else value
+        single = isinstance(given, str) or not isinstance(given, Iterable)
+        several: Any = given if option.multiple and not single else [given]
+        if isinstance(option.type, click.Path):
+            several = [_typed_path(place, what) for place in several]
+        yield from [str(w) for w in typed(option, several if option.multiple else several[0])]
+
+
+def _path(place: Any) -> Path:
+    """Return a path with `~` expanded.
+
+    Raises:
+        InputError: it is none.
+    """
+    return Path(_typed_path(place))
+
+
+def _typed_path(place: Any, what: str = "the path") -> str:
+    """Return a path as the command takes it; `~`, which shells expand, is the home.
+
+    Raises:
+        InputError: it is none.
+    """
+    text = os.fspath(place) if isinstance(place, str | os.PathLike) else None
+    if not isinstance(text, str):
+        raise InputError(
+            f"{what} is {place!r}; a text, a pathlib.Path or the result of a verb is accepted."
+        )
+    return os.path.expanduser(text)

@@ -191,7 +191,7 @@ def test_import_is_cheap_and_loads_nothing() -> None:
 
 
 def test_every_promised_name_is_there() -> None:
-    assert set(VERBS) <= set(rs.__all__)
+    assert set(VERBS) <= set(dir(rs)) == {*rs.__all__, "__version__"}
     assert all(callable(getattr(rs, name)) for name in rs.__all__)
     import realsim.review.server  # with all that the page imports
 
@@ -221,8 +221,10 @@ def test_a_plan_is_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         folder.mkdir()
     monkeypatch.chdir(by_verb)
     steps: list[tuple[str, int, int]] = []
-    made = rs.plan("plan.json", views=4, progress=lambda *step: steps.append(step))
-    words = ("--views", "4", "--out", "plan.json", "--no-pictures", "--json")
+    monkeypatch.setenv("HOME", str(by_verb))
+    given = {"center": np.array([0.4, 0, 0]), "overwrite": np.False_}
+    made = rs.plan("~/plan.json", views=4, progress=lambda *step: steps.append(step), **given)
+    words = ("--views", "4", "--center", "0.4,0,0", "--out", "plan.json", "--no-pictures", "--json")
     monkeypatch.chdir(by_command)
     done = realsim("plan", *words)
     assert done.returncode == 0 and made.passed
@@ -251,7 +253,7 @@ def test_labels_are_the_commands(tmp_path: Path, registered_few: Path) -> None:
 
 
 def test_errors_say_what_the_command_prints(tmp_path: Path) -> None:
-    def told(verb: str, *places: str, **options: object) -> str:
+    def told(verb: str, *places: object, **options: object) -> str:
         with pytest.raises(rs.InputError) as refused:
             getattr(rs, verb)(*places, **options)
         return str(refused.value)
@@ -268,6 +270,10 @@ def test_errors_say_what_the_command_prints(tmp_path: Path) -> None:
     assert "is no page that this command wrote" in told("review", nowhere, static=mine)
     assert "register has no option 'object_'; it has " in told("register", nowhere, object_="mug")
     assert "kind are for an import" in told("open", nowhere, kind="bop")
+    for verb, *places in (("open", 5), ("open", b"s"), ("open", None, "s"), ("plan", None)):
+        assert "the path is " in told(verb, *places)
+    assert "plan: overwrite is 'no'; True or False" in told("plan", overwrite="no")
+    assert "Missing option '--to'" in told("export", nowhere)
 
 
 def test_a_failed_check_is_a_result(tmp_path: Path) -> None:
