@@ -231,8 +231,7 @@ def render(
 
 
 def export(
-    *sources: Place, to: str | None = None, out: Place | None = None,
-    progress: Progress | None = None, **options: Any,
+    *sources: Place, to: str, out: Place, progress: Progress | None = None, **options: Any,
 ) -> Result[Path]:  # fmt: skip
     """Write sessions or data sets in another format; the record is the path of the card."""
     options |= {"to": to, "out": out}

@@ -273,7 +273,6 @@ def test_errors_say_what_the_command_prints(tmp_path: Path) -> None:
     for verb, *places in (("open", 5), ("open", b"s"), ("open", None, "s"), ("plan", None)):
         assert "the path is " in told(verb, *places)
     assert "plan: overwrite is 'no'; True or False" in told("plan", overwrite="no")
-    assert "Missing option '--to'" in told("export", nowhere)
 
 
 def test_a_failed_check_is_a_result(tmp_path: Path) -> None:

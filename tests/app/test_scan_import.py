@@ -131,6 +131,7 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(meshes: Path, tmp
     ("words", "said"),
     [
         (["wedge.ply"], "does not state its unit"),
+        (["wedge.ply", "--unit", "m"], "as mm"),
         (["box.ply", "--unit", "inch"], "4 mm to 1.7 m is accepted"),
         (["broken.obj", "--unit", "mm"], "mesh: it seems to be cut off or damaged. Copy"),
         (["points.ply", "--unit", "mm"], "no triangles"),

@@ -256,6 +256,7 @@ def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
     [
         ("hand.urdf", 'mimic joint="finger_joint"', 'mimic joint="thumb"', "mimics 'thumb'"),
         ("hand.urdf", 'multiplier="-1"', 'multiplier="-0.9"', "pads turn by"),
+        ("robot.toml", "max_opening_m = 0.085", "max_opening_m = 85.0", "write 0.085 if"),
         ("robot.toml", "max_opening_m = 0.085", "max_opening_m = 8.5", "0.085 if 8.5 is in cent"),
         ("robot.toml", "radius_m = 0.05715", "radius_m = 0.070", "mm of the law"),
         ("robot.toml", "radius_m = 0.05715", "radius_m = 57.15", "write 0.05715 if 57"),
